@@ -1,0 +1,35 @@
+"""Where the repository's data folders lie, in a checkout and in an installed wheel."""
+
+import os
+from pathlib import Path
+
+from iga_drake.errors import IgaDrakeError
+
+
+def _data_dir(name: str) -> Path:
+    package = Path(__file__).resolve().parent
+    for candidate in (package.parent / name, package / "_data" / name):
+        if candidate.is_dir():
+            return candidate
+    raise IgaDrakeError(
+        f"folder '{name}' not found beside or inside {package}: reinstall the package or run from "
+        "a checkout"
+    )
+
+
+def models_dir() -> Path:
+    """The `models/` folder: robot description, trained weights, demonstrations."""
+    return _data_dir("models")
+
+
+def diagrams_dir() -> Path:
+    """The `diagrams/` folder: scenario YAML files."""
+    return _data_dir("diagrams")
+
+
+def cache_dir() -> Path:
+    """A writable folder for files derived once from other packages (converted meshes)."""
+    root = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    path = Path(root) / "iga_drake"
+    path.mkdir(parents=True, exist_ok=True)
+    return path
