@@ -1,0 +1,45 @@
+"""Abstract values that travel between the systems of the diagram."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+
+@dataclass(frozen=True)
+class EndEffectorTarget:
+    """One step for the waypoint follower: go there, then set the hand, then settle."""
+
+    # Rises by one with every new target; the follower reports the last one it finished.
+    sequence: int
+    # Target pose of the end-effector frame E (`panda_tcp`) in the world (= base) frame.
+    X_WE: RigidTransform
+    # Opening of the hand (m) commanded while moving.
+    opening_moving: float
+    # Opening of the hand (m) commanded once the pose is reached.
+    opening_reached: float
+    # Time to wait after the pose is reached and the hand was commanded (s).
+    settle: float = 0.0
+    # Scales the follower's linear and angular speed, in (0, 1].
+    speed_scale: float = 1.0
+    # Joint angles (rad) towards which the controller's null space is pulled.
+    nominal_posture: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class FollowerStatus:
+    """What the waypoint follower reports."""
+
+    # The last target whose pose was reached and whose settling time is over (0: none).
+    sequence_reached: int = 0
+    # Distance left to the present target (m, rad), measured end effector against target.
+    position_error: float = 0.0
+    rotation_error: float = 0.0
+
+
+@dataclass(frozen=True)
+class SupervisorStatus:
+    """Whether the supervisor lets commands through, and if not, why."""
+
+    holding: bool = False
+    reason: str = ""
