@@ -1,0 +1,163 @@
+"""One object of a parametric family: mesh, parts, named frames, convex pieces, mass."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import trimesh
+
+from iga_drake.errors import IgaDrakeError
+
+
+class ShapeError(IgaDrakeError):
+    """A shape's parameters, mesh or pieces are not valid."""
+
+
+@dataclass(frozen=True)
+class MassProperties:
+    """Mass and inertia of a homogeneous solid in its object frame O."""
+
+    mass: float  # kg
+    p_OCcm: np.ndarray  # (3,) centre of mass, m
+    I_CcmO: np.ndarray  # (3, 3) inertia about the centre of mass, in O's axes, kg m^2
+
+
+@dataclass(frozen=True)
+class ShapeInstance:
+    """An object of `family` in its own frame O (metres, z up, standing on z = 0).
+
+    Every instance of a family has the same `faces` and vertex order, so vertex i (and a point with
+    fixed barycentric coordinates on face i) is the same place on every instance. The mesh is
+    closed; it may consist of several closed components that overlap a little where parts join.
+    """
+
+    family: str
+    parameters: dict[str, float]
+    vertices: np.ndarray  # (V, 3) m
+    faces: np.ndarray  # (F, 3) int, counterclockwise seen from outside
+    part_labels: np.ndarray  # (F,) int, index into part_names
+    part_names: tuple[str, ...]
+    frames: dict[str, np.ndarray] = field(default_factory=dict)  # name -> X_OF (4, 4)
+    convex_pieces: tuple[np.ndarray, ...] = ()  # each (n >= 4, 3) m, union covers the solid
+    density: float = 1000.0  # kg / m^3
+
+    def __post_init__(self) -> None:
+        vertices = np.asarray(self.vertices, dtype=np.float64)
+        faces = np.asarray(self.faces, dtype=np.int64)
+        labels = np.asarray(self.part_labels, dtype=np.int64)
+        self._require(
+            vertices.ndim == 2 and vertices.shape[1] == 3 and len(vertices) >= 4,
+            f"vertices: expected (V >= 4, 3), got {vertices.shape}",
+        )
+        self._require(bool(np.isfinite(vertices).all()), "vertices: not all are finite")
+        self._require(
+            faces.ndim == 2 and faces.shape[1] == 3 and len(faces) >= 4,
+            f"faces: expected (F >= 4, 3), got {faces.shape}",
+        )
+        self._require(
+            faces.min() >= 0 and faces.max() < len(vertices),
+            f"faces: indices {faces.min()}..{faces.max()} leave the {len(vertices)} vertices",
+        )
+        self._require(
+            labels.shape == (len(faces),),
+            f"part_labels: expected ({len(faces)},), one a face, got {labels.shape}",
+        )
+        self._require(
+            labels.min() >= 0 and labels.max() < len(self.part_names),
+            f"part_labels: {labels.min()}..{labels.max()} for {len(self.part_names)} part names",
+        )
+        self._require(
+            np.isfinite(self.density) and self.density > 0,
+            f"density: {self.density} kg/m^3, must be positive",
+        )
+        frames = {}
+        for name, value in self.frames.items():
+            frame = np.asarray(value, dtype=np.float64)
+            self._require(
+                frame.shape == (4, 4)
+                and np.allclose(frame[3], (0, 0, 0, 1))
+                and np.allclose(frame[:3, :3].T @ frame[:3, :3], np.eye(3), atol=1e-6)
+                and np.linalg.det(frame[:3, :3]) > 0,
+                f"frames['{name}']: not a rigid (4, 4) transform",
+            )
+            frames[name] = frame
+        pieces = tuple(np.asarray(piece, dtype=np.float64) for piece in self.convex_pieces)
+        for index, piece in enumerate(pieces):
+            self._require(
+                piece.ndim == 2
+                and piece.shape[1] == 3
+                and len(piece) >= 4
+                and bool(np.isfinite(piece).all()),
+                f"convex_pieces[{index}]: expected finite (n >= 4, 3), got {piece.shape}",
+            )
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+        object.__setattr__(self, "part_labels", labels)
+        object.__setattr__(self, "part_names", tuple(self.part_names))
+        object.__setattr__(self, "parameters", {k: float(v) for k, v in self.parameters.items()})
+        object.__setattr__(self, "frames", frames)
+        object.__setattr__(self, "convex_pieces", pieces)
+
+    def _require(self, condition: bool, message: str) -> None:
+        if not condition:
+            raise ShapeError(f"ShapeInstance '{self.family}': {message}")
+
+    @cached_property
+    def mesh(self) -> trimesh.Trimesh:
+        """The surface, vertex order kept. Don't change it."""
+        return trimesh.Trimesh(vertices=self.vertices, faces=self.faces, process=False)
+
+    @cached_property
+    def mass_properties(self) -> MassProperties:
+        """Of the homogeneous solid (what overlaps at a joint of two parts counts twice).
+
+        Raises `ShapeError` where the mesh is not closed or is turned inside out.
+        """
+        self.check_closed()
+        properties = self.mesh.mass_properties
+        return MassProperties(
+            mass=float(properties.mass) * self.density,
+            p_OCcm=np.asarray(properties.center_mass, dtype=np.float64),
+            I_CcmO=np.asarray(properties.inertia, dtype=np.float64) * self.density,
+        )
+
+    def check_closed(self) -> None:
+        """Raises `ShapeError` unless the faces close the solid and all look outwards."""
+        self._require(self.mesh.is_watertight, "the mesh is not watertight")
+        self._require(self.mesh.is_winding_consistent, "the faces' orientation is not consistent")
+        self._require(self.mesh.volume > 0, "the faces look inwards (negative volume)")
+
+    def with_mass(self, mass: float) -> "ShapeInstance":
+        """The same shape with the density that gives it `mass` (kg)."""
+        scale = mass / self.mass_properties.mass
+        return ShapeInstance(
+            family=self.family,
+            parameters=self.parameters,
+            vertices=self.vertices,
+            faces=self.faces,
+            part_labels=self.part_labels,
+            part_names=self.part_names,
+            frames=self.frames,
+            convex_pieces=self.convex_pieces,
+            density=self.density * scale,
+        )
+
+
+def frame(
+    origin: tuple[float, float, float] | np.ndarray,
+    *,
+    x: tuple[float, float, float] | np.ndarray = (1.0, 0.0, 0.0),
+    z: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 1.0),
+) -> np.ndarray:
+    """X_OF (4, 4) at `origin` (m) with the x axis along `x` and z as near to `z` as it can be."""
+    x_axis = np.asarray(x, dtype=np.float64)
+    x_axis = x_axis / np.linalg.norm(x_axis)
+    y_axis = np.cross(np.asarray(z, dtype=np.float64), x_axis)
+    norm = np.linalg.norm(y_axis)
+    if norm < 1e-9:
+        raise ShapeError("frame: x and z are parallel")
+    y_axis = y_axis / norm
+    X = np.eye(4)
+    X[:3, 0], X[:3, 1], X[:3, 2] = x_axis, y_axis, np.cross(x_axis, y_axis)
+    X[:3, 3] = origin
+    return X
