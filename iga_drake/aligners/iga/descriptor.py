@@ -1,0 +1,210 @@
+"""SE(3)-invariant dense descriptors of a point cloud, with whole-object context.
+
+Every node carries invariant scalars and equivariant vectors (Vector Neurons, Deng et al. 2021). Layers
+attend over all nodes of the object with invariant pair features only, and pass equivariant
+messages. Cross and triple products make the features sensitive to handedness: without them the left and
+the right side of a mirror-symmetric object would look the same. The result is exactly invariant under
+rotations and translations, and independent of the order of the points for given nodes.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from iga_drake.geometry.clouds import furthest_point_sampling
+
+
+@dataclass(frozen=True)
+class DescriptorConfig:
+    """Sizes of the network; saved with the weights."""
+
+    scalars: int = 96
+    vectors: int = 16
+    heads: int = 4
+    layers: int = 4
+    # Radii of the local shells, in units of the cloud's root-mean-square radius.
+    shells: tuple[float, ...] = (0.12, 0.25, 0.45, 0.75, 1.1, 1.6)
+    pair_hidden: int = 24
+    distance_bases: int = 8
+    descriptor: int = 64
+
+
+class VectorLinear(nn.Module):
+    """Mixes vector channels (..., 3, C) -> (..., 3, D); commutes with rotations."""
+
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(outputs, inputs) / inputs**0.5)
+
+    def forward(self, v: Tensor) -> Tensor:
+        return nn.functional.linear(v, self.weight)
+
+
+class LocalMoments(nn.Module):
+    """Encodes the surroundings of each node by moments over radial shells of the dense cloud.
+
+    Per shell: how full it is, the mean offset (a vector) and the second moment (a symmetric matrix).
+    Learned mixtures of the vectors, also after multiplication by the second moments, are equivariant;
+    their inner and triple products are invariant. Costs two matrix products, no neighbour search.
+    """
+
+    def __init__(self, config: DescriptorConfig):
+        super().__init__()
+        S, c = len(config.shells), config.vectors
+        self.register_buffer("radii", torch.tensor(config.shells), persistent=False)
+        self.mix = VectorLinear(S + 1, c)
+        self.bend = VectorLinear(S * c, c)
+        self.out = VectorLinear(2 * c + S + 1, c)
+        self.embed = nn.Sequential(
+            nn.Linear(5 * S + 4 * c, config.scalars),
+            nn.GELU(),
+            nn.Linear(config.scalars, config.scalars),
+        )
+
+    def forward(self, x: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        # x (B, P, 3) dense cloud, p (B, M, 3) nodes -> scalars (B, M, d), vectors (B, M, 3, c)
+        B, M, _ = p.shape
+        S = len(self.radii)
+        distance = torch.cdist(p, x)[:, :, None]  # (B, M, 1, P)
+        r = self.radii[:, None]
+        window = torch.exp(-((distance - r) ** 2) / (2 * (0.4 * r) ** 2))  # (B, M, S, P)
+        outer = (x[..., :, None] * x[..., None, :]).flatten(2)
+        moments = window.flatten(1, 2) @ torch.cat((torch.ones_like(x[..., :1]), x, outer), -1)
+        moments = moments.reshape(B, M, S, 13)
+        mass = moments[..., :1].clamp_min(1e-3)
+        mean = moments[..., 1:4] / mass
+        second = (moments[..., 4:] / mass).reshape(B, M, S, 3, 3)
+        q = p[:, :, None]
+        offset = (mean - q) / r  # (B, M, S, 3)
+        mean_q = mean[..., :, None] * q[..., None, :]
+        second = second - mean_q - mean_q.transpose(-1, -2) + q[..., :, None] * q[..., None, :]
+        second = second / r[..., None] ** 2
+        base = torch.cat((offset, -q), 2).transpose(-1, -2)  # (B, M, 3, S + 1)
+        v = self.mix(base)
+        bent = (second @ v[:, :, None]).transpose(2, 3).flatten(3)  # (B, M, 3, S c)
+        w = self.bend(bent)
+        v_out = self.out(torch.cat((v, w, base), -1))
+        half = v.shape[-1] // 2
+        cross = torch.linalg.cross(v, w, dim=-2)
+        invariants = torch.cat(
+            (
+                mass[..., 0].log(),
+                offset.square().sum(-1),
+                -(offset * q).sum(-1),
+                second.diagonal(dim1=-2, dim2=-1).sum(-1),
+                second.square().sum((-1, -2)),
+                v.square().sum(-2),
+                (v * w).sum(-2),
+                w.square().sum(-2),
+                (cross[..., :half] * v[..., half:]).sum(-2),
+                (cross[..., half:] * w[..., :half]).sum(-2),
+            ),
+            -1,
+        )
+        return self.embed(invariants), v_out
+
+
+class ContextLayer(nn.Module):
+    """Attention over the nodes of one object: scalars, vectors and invariant pair features."""
+
+    def __init__(self, config: DescriptorConfig):
+        super().__init__()
+        d, c, h = config.scalars, config.vectors, config.heads
+        self.heads, self.width = h, d // h
+        self.probe = 4
+        self.norm = nn.LayerNorm(d)
+        self.qkv = nn.Linear(d, 3 * d)
+        self.direction = VectorLinear(c, self.probe)
+        self.pair = nn.Sequential(
+            nn.Linear(config.distance_bases + 2 * self.probe, config.pair_hidden),
+            nn.GELU(),
+            nn.Linear(config.pair_hidden, 2 * h),
+        )
+        self.value_v = VectorLinear(c, c)
+        self.out = nn.Linear(d, d)
+        self.triple = VectorLinear(c, 3 * c)
+        self.norm2 = nn.LayerNorm(d + 4 * c)
+        self.mlp = nn.Sequential(nn.Linear(d + 4 * c, 2 * d), nn.GELU(), nn.Linear(2 * d, d + 2 * c))
+        self.vector_out = VectorLinear(c + h, c)
+        self.self_mix = VectorLinear(2 * c, c)
+
+    def forward(
+        self, s: Tensor, v: Tensor, bases: Tensor, unit: Tensor, relative: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        # s (B, M, d), v (B, M, 3, c), bases (B, M, M, K), unit and relative (B, M, M, 3): j - i
+        B, M, d = s.shape
+        h, c = self.heads, v.shape[-1]
+        probe = self.direction(v)  # (B, M, 3, probes)
+        along_i = unit @ probe  # (B, M, M, probes)
+        along_j = (unit.transpose(1, 2) @ probe).transpose(1, 2)
+        pair = self.pair(torch.cat((bases, along_i, along_j), -1))  # (B, M, M, 2h)
+        bias, gate = pair.permute(0, 3, 1, 2).split(h, 1)  # (B, h, M, M)
+        q, k, value = self.qkv(self.norm(s)).reshape(B, M, 3, h, self.width).permute(2, 0, 3, 1, 4)
+        attention = (q @ k.transpose(-1, -2) / self.width**0.5 + bias).softmax(-1)
+        s = s + self.out((attention @ value).transpose(1, 2).reshape(B, M, d))
+        value_v = self.value_v(v).reshape(B, M, 3, h, c // h).permute(0, 3, 1, 2, 4)
+        moved = (attention @ value_v.flatten(3)).reshape(B, h, M, 3, c // h)
+        moved = moved.permute(0, 2, 3, 1, 4).reshape(B, M, 3, c)
+        # sum_j g_ij (p_j - p_i), without the (B, h, M, M, 3) products
+        weight = attention * gate
+        p = relative[:, 0]  # positions up to a common shift
+        pull = weight @ p[:, None] - weight.sum(-1, keepdim=True) * p[:, None]  # (B, h, M, 3)
+        message = self.vector_out(torch.cat((moved, pull.permute(0, 2, 3, 1)), -1))
+        e1, e2, e3 = self.triple(message + v).chunk(3, -1)
+        cross = torch.linalg.cross(e1, e2, dim=-2)
+        invariants = torch.cat(
+            [(x * y).sum(-2) for x, y in ((e1, e3), (e2, e3), (cross, e3), (v, message))], -1
+        )
+        update, gates = self.mlp(self.norm2(torch.cat((s, invariants), -1))).split((d, 2 * c), -1)
+        s = s + update
+        g1, g2 = gates[:, :, None].chunk(2, -1)
+        v = v + torch.sigmoid(g1) * message + torch.tanh(g2) * self.self_mix(
+            torch.cat((message, cross), -1)
+        )
+        norm = v.square().sum(-2, keepdim=True).mean(-1, keepdim=True).add(1e-6).sqrt()
+        return s, v / norm.clamp_min(1.0)
+
+
+class DescriptorNet(nn.Module):
+    """Clouds (B, P, 3) and node indices (B, M) -> unit descriptors (B, M, D)."""
+
+    def __init__(self, config: DescriptorConfig):
+        super().__init__()
+        self.config = config
+        self.local = LocalMoments(config)
+        self.layers = nn.ModuleList(ContextLayer(config) for _ in range(config.layers))
+        self.head = nn.Sequential(
+            nn.LayerNorm(config.scalars), nn.Linear(config.scalars, config.descriptor)
+        )
+        self.log_temperature = nn.Parameter(torch.tensor(2.3))
+
+    @staticmethod
+    def normalise(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Centres clouds and scales them to unit root-mean-square radius."""
+        centre = points.mean(1, keepdim=True)
+        scale = (points - centre).square().sum(-1).mean(1).sqrt().clamp_min(1e-4)
+        return (points - centre) / scale[:, None, None], centre, scale
+
+    def forward(self, points: Tensor, nodes: Tensor) -> Tensor:
+        cfg = self.config
+        x, _, _ = self.normalise(points)
+        p = torch.gather(x, 1, nodes[..., None].expand(-1, -1, 3))  # (B, M, 3)
+        s, v = self.local(x, p)
+        relative = p[:, None] - p[:, :, None]  # (B, M, M, 3)
+        length = relative.square().sum(-1, keepdim=True).add(1e-8).sqrt()
+        unit = relative / (length + 0.02)
+        centres = torch.linspace(0, 3.0, cfg.distance_bases, device=p.device, dtype=p.dtype)
+        bases = torch.exp(-((length - centres) ** 2) / (2 * 0.3**2))
+        for layer in self.layers:
+            s, v = layer(s, v, bases, unit, relative)
+        return nn.functional.normalize(self.head(s), dim=-1)
+
+    def similarity(self, a: Tensor, b: Tensor) -> Tensor:
+        """Logits (..., M, N) of a match between descriptors (..., M, D) and (..., N, D)."""
+        return self.log_temperature.clamp(max=4.6).exp() * (a @ b.transpose(-1, -2))
+
+
+def sample_nodes(points: Tensor, count: int) -> Tensor:
+    """Node indices (B, count): deterministic furthest point sampling."""
+    return furthest_point_sampling(points, min(count, points.shape[1]))
