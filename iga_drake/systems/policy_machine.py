@@ -44,12 +44,14 @@ class PolicyConfig:
     period: float = 0.05
     # Time (s) that the scene gets to come to rest before it is observed.
     observe_settle: float = 0.5
-    # Time (s) between attempts to observe, and the limit of an observing phase.
-    observe_retry: float = 1.0
-    observe_limit: float = 3.0
+    # Time (s) between attempts to observe.
+    observe_retry: float = 2.0
+    # Limits (s) of the observing phases.
+    observe_target_limit: float = 10.0
+    observe_grasped_limit: float = 10.0
     # Fewest usable points of an observed cloud.
     minimum_points: int = 64
-    # Limits (s) of the moving phases, simulated or real time.
+    # Limits (s) of the moving phases.
     present_limit: float = 30.0
     execute_limit: float = 60.0
     # Limit (s) of one inference, wall-clock time.
@@ -186,7 +188,10 @@ class PolicyMachine:
             )
         except Refusal as refusal:
             again = now + self.config.observe_retry
-            if again - memory.phase_started > self.config.observe_limit:
+            limit = (
+                self.config.observe_target_limit if of_target else self.config.observe_grasped_limit
+            )
+            if again - memory.phase_started > limit:
                 return self._refuse(memory, now, str(refusal), "perception")
             return replace(memory, observe_next=again)
         if of_target:

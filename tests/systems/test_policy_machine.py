@@ -79,9 +79,9 @@ def test_a_better_second_look_is_taken():
     memory = machine.advance(machine.start(), inputs, 0.5)
     assert memory.status.phase is Phase.OBSERVE_TARGET
     inputs.target = TARGET
-    memory = machine.advance(memory, inputs, 1.0)
+    memory = machine.advance(memory, inputs, 2.0)
     assert memory.status.phase is Phase.OBSERVE_TARGET, "too early to look again"
-    assert machine.advance(memory, inputs, 1.6).status.phase is Phase.INFER
+    assert machine.advance(memory, inputs, 2.6).status.phase is Phase.INFER
 
 
 @pytest.mark.parametrize(

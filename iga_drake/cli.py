@@ -1,0 +1,272 @@
+"""The `iga` command. Each subcommand imports what it needs when it runs.
+
+Exit status: 0 for success, 1 for an episode that did not succeed, 2 for bad input (one line says
+what was found and what to do).
+"""
+
+import argparse
+import importlib
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from iga_drake.errors import IgaDrakeError
+
+SUCCESS, FAILURE, BAD_INPUT = 0, 1, 2
+ALIGNERS = ("icp", "iga", "expert")
+
+
+class CommandError(IgaDrakeError):
+    """A command was asked for something that it can't do."""
+
+
+def scenario_path(text: str) -> Path:
+    """`text` as a path, or as the name of a file in `diagrams/` (with or without .yaml)."""
+    from iga_drake.paths import diagrams_dir
+
+    path = Path(text)
+    if path.is_file():
+        return path
+    named = diagrams_dir() / f"{path.name.removesuffix('.yaml')}.yaml"
+    if path.name == text and named.is_file():
+        return named
+    known = ", ".join(sorted(p.stem for p in diagrams_dir().glob("*.yaml")))
+    raise CommandError(f"scenario {text}: no such file; name a YAML file or one of: {known}")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes under a temporary name and renames, so that nobody sees half a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+# simulate
+
+
+def _add_simulate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scenario", help="scenario YAML, e.g. diagrams/stack.yaml")
+    parser.add_argument("--seed", type=int, default=0, help="scene, noise and aligner (default 0)")
+    parser.add_argument("--aligner", choices=ALIGNERS, help="default: the scenario's")
+    parser.add_argument(
+        "--split", choices=("test", "demonstration"), default="test", help="which object instances"
+    )
+    parser.add_argument("--meshcat", action="store_true", help="show the scene in a browser")
+    parser.add_argument("--html", type=Path, metavar="OUT", help="write a replay to look at")
+    parser.add_argument("--result", type=Path, metavar="JSON", help="write the result as JSON")
+
+
+def _simulate(arguments: argparse.Namespace) -> int:
+    from iga_drake.station.scenario import load_scenario
+    from iga_drake.tasks.episode import run_episode
+
+    path = scenario_path(arguments.scenario)
+    scenario = load_scenario(path)
+    if arguments.meshcat:
+        scenario.visualization.meshcat = True
+    result = run_episode(
+        scenario,
+        seed=arguments.seed,
+        aligner=arguments.aligner,
+        split=arguments.split,
+        html=arguments.html,
+    )
+    if arguments.result:
+        write_text(arguments.result, json.dumps(result.row()) + "\n")
+    return SUCCESS if result.success else FAILURE
+
+
+# demonstrate
+
+
+def _add_demonstrate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scenario", help="scenario YAML, e.g. diagrams/stack.yaml")
+    parser.add_argument("--count", type=int, default=5, help="demonstrations to keep (default 5)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first attempt")
+
+
+def _demonstrate(arguments: argparse.Namespace) -> int:
+    from iga_drake.aligners.demonstration import write_demonstrations
+    from iga_drake.station.scenario import load_scenario
+    from iga_drake.tasks.episode import record_demonstrations
+
+    scenario = load_scenario(scenario_path(arguments.scenario))
+    demonstrations = record_demonstrations(
+        scenario, count=arguments.count, first_seed=arguments.seed
+    )
+    write_demonstrations(arguments.out, demonstrations)
+    print(f"{len(demonstrations)} demonstrations of '{demonstrations.task}' in {arguments.out}")
+    return SUCCESS
+
+
+# view
+
+
+def _add_view(parser: argparse.ArgumentParser) -> None:
+    kinds = parser.add_subparsers(dest="kind", required=True)
+    demonstrations = kinds.add_parser("demonstrations", help="clouds and waypoints in 3D")
+    demonstrations.add_argument("folder", type=Path)
+    demonstrations.add_argument(
+        "--html", type=Path, metavar="OUT", help="write a page instead of serving one"
+    )
+
+
+def _view(arguments: argparse.Namespace) -> int:
+    from iga_drake.aligners.demonstration import read_demonstrations
+    from iga_drake.evaluation.replay import demonstrations_html, serve_demonstrations
+
+    demonstrations = read_demonstrations(arguments.folder)
+    for index, demonstration in enumerate(demonstrations.demonstrations):
+        metadata = ", ".join(f"{key} {value}" for key, value in demonstration.metadata.items())
+        print(
+            f"{demonstrations.task} {index}: {len(demonstration.grasped)} grasped points, "
+            f"{len(demonstration.target)} target points, waypoints "
+            f"{', '.join(demonstration.names)}; {metadata}"
+        )
+    if arguments.html:
+        write_text(arguments.html, demonstrations_html(demonstrations))
+        print(f"written: {arguments.html}")
+    else:
+        serve_demonstrations(demonstrations)
+    return SUCCESS
+
+
+# evaluate
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _add_evaluate(parser: argparse.ArgumentParser) -> None:
+    kinds = parser.add_subparsers(dest="kind", required=True)
+    tasks = kinds.add_parser("tasks", help="success of whole episodes")
+    tasks.add_argument("--tasks", type=_names, default=["grasp", "stack"], help="scenarios")
+    tasks.add_argument("--trials", type=int, default=15)
+    tasks.add_argument("--aligner", type=_names, default=["iga", "icp"])
+    tasks.add_argument("--seed", type=int, default=0, help="seed of the first trial")
+    tasks.add_argument("--split", choices=("test", "demonstration"), default="test")
+    tasks.add_argument("--processes", type=int, default=1, help="episodes at a time")
+    tasks.add_argument("--results", type=Path, help="results file to append to and to go on from")
+    tasks.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from iga_drake.evaluation.task_success import Trial, evaluate, format_table, summarise
+    from iga_drake.station.scenario import load_scenario
+
+    if arguments.trials < 1:
+        raise CommandError(f"--trials {arguments.trials}: at least 1 is needed")
+    unknown = [name for name in arguments.aligner if name not in ALIGNERS]
+    if unknown:
+        raise CommandError(f"--aligner {unknown[0]}: unknown; one of: {', '.join(ALIGNERS)}")
+    trials = []
+    for name in arguments.tasks:
+        path = scenario_path(name)
+        task = load_scenario(path).task.name
+        for aligner in arguments.aligner:
+            for seed in range(arguments.seed, arguments.seed + arguments.trials):
+                trials.append((task, Trial(scenario=str(path), aligner=aligner, seed=seed)))
+
+    def show(result: Any) -> None:
+        verdict = "success" if result.success else f"failure ({result.cause}): {result.reason}"
+        print(f"{result.task} {result.aligner} seed {result.seed}: {verdict}", file=sys.stderr)
+
+    results = evaluate(
+        trials,
+        split=arguments.split,
+        processes=arguments.processes,
+        results_file=arguments.results,
+        on_result=show,
+    )
+    if arguments.json:
+        document = {"summary": summarise(results), "trials": [asdict(r) for r in results]}
+        print(json.dumps(document, indent=2))
+    else:
+        print(format_table(results))
+    return SUCCESS
+
+
+# benchmark and train: modules with `add_arguments(parser)` and `main(arguments) -> int`
+
+DELEGATES = ("benchmark", "train")
+BENCHMARKS = ("fusion", "inference", "ik")
+
+
+def _delegate(module: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is not None and module.startswith(error.name):
+            raise CommandError(f"this installation has no {module}: install a full one") from error
+        raise
+
+
+def _add_benchmark(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("what", choices=BENCHMARKS)
+
+
+def _benchmark(arguments: argparse.Namespace) -> int:
+    module = _delegate(f"iga_drake.evaluation.benchmark_{arguments.what}")
+    return _run_delegate(module, f"iga benchmark {arguments.what}", arguments.options)
+
+
+def _add_train(parser: argparse.ArgumentParser) -> None:
+    pass  # every option belongs to the training command
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    module = _delegate("iga_drake.training.cli")
+    return _run_delegate(module, "iga train", arguments.options)
+
+
+def _run_delegate(module: Any, prog: str, options: Sequence[str]) -> int:
+    parser = argparse.ArgumentParser(prog=prog, description=module.__doc__)
+    module.add_arguments(parser)
+    return int(module.main(parser.parse_args(options)) or SUCCESS)
+
+
+COMMANDS: dict[str, tuple[str, Callable[[Any], None], Callable[[Any], int]]] = {
+    "simulate": ("run one episode of a scenario", _add_simulate, _simulate),
+    "demonstrate": (
+        "let the scripted expert record demonstrations",
+        _add_demonstrate,
+        _demonstrate,
+    ),
+    "view": ("look at demonstrations", _add_view, _view),
+    "evaluate": ("success rates of whole tasks", _add_evaluate, _evaluate),
+    "benchmark": ("time a part", _add_benchmark, _benchmark),
+    "train": ("train the learned aligner", _add_train, _train),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs `iga` with `arguments` (default: the process's) and returns its exit status."""
+    parser = argparse.ArgumentParser(prog="iga", description="Few-shot manipulation in Drake.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    for name, (text, add, _) in COMMANDS.items():
+        helps = name not in DELEGATES  # they print their own
+        add(commands.add_parser(name, help=text, description=text, add_help=helps))
+    parsed, parsed.options = parser.parse_known_args(arguments)
+    if parsed.options and parsed.command not in DELEGATES:
+        parser.error(f"unrecognized arguments: {' '.join(parsed.options)}")
+    try:
+        return COMMANDS[parsed.command][2](parsed)
+    except IgaDrakeError as error:
+        print(f"iga {parsed.command}: {' '.join(str(error).split())}", file=sys.stderr)
+        return BAD_INPUT
+    except BrokenPipeError:
+        return FAILURE
+
+
+if __name__ == "__main__":
+    sys.exit(main())
