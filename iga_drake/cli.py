@@ -256,9 +256,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, (text, add, _) in COMMANDS.items():
         helps = name not in DELEGATES  # they print their own
         add(commands.add_parser(name, help=text, description=text, add_help=helps))
-    parsed, parsed.options = parser.parse_known_args(arguments)
-    if parsed.options and parsed.command not in DELEGATES:
-        parser.error(f"unrecognized arguments: {' '.join(parsed.options)}")
+    parsed, others = parser.parse_known_args(arguments)
+    if others and parsed.command not in DELEGATES:
+        parser.error(f"unrecognized arguments: {' '.join(others)}")
+    parsed.options = others
     try:
         return COMMANDS[parsed.command][2](parsed)
     except IgaDrakeError as error:

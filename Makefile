@@ -1,0 +1,61 @@
+# `make demo` and `make test` set up everything in .venv, then run. The second run is quick.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# The CPU build that this release was tested with; a newer Python gets the newest torch.
+TORCH ?= torch==2.13.0
+EXTRAS := icp,visuals,train,notebook,dev
+PACKAGES := libusb-1.0-0 libgl1 libegl1 libgl1-mesa-dri libgomp1 python3-venv
+
+.PHONY: demo test check setup clean
+.DEFAULT_GOAL := setup
+
+setup: $(VENV)/.installed
+
+demo: setup
+	@mkdir -p outputs
+	$(BIN)/iga simulate diagrams/grasp.yaml --seed 3 --html outputs/grasp.html
+	$(BIN)/iga simulate diagrams/stack.yaml --seed 3 --html outputs/stack.html
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+test: check
+	$(BIN)/pytest --nbmake tests notebooks
+
+clean:
+	rm -rf $(VENV) outputs
+
+$(VENV)/.system:
+	@missing=""; \
+	if command -v dpkg-query >/dev/null 2>&1; then \
+	  for package in $(PACKAGES); do \
+	    dpkg-query -W -f='$${Status}' $$package 2>/dev/null | grep -q 'ok installed' || missing="$$missing $$package"; \
+	  done; \
+	fi; \
+	if [ "$$missing" = " python3-venv" ] && $(PYTHON) -c 'import ensurepip, venv' 2>/dev/null; then missing=""; fi; \
+	if [ -n "$$missing" ]; then \
+	  if [ "$$(id -u)" = 0 ]; then \
+	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing; \
+	  else \
+	    echo "missing system libraries, install them with: sudo apt-get install$$missing" >&2; exit 1; \
+	  fi; \
+	fi
+	@mkdir -p $(VENV) && touch $@
+
+$(BIN)/python: | $(VENV)/.system
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "Python >= 3.11 is needed, $$($(PYTHON) --version) found: make PYTHON=python3.11" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+
+$(VENV)/.torch: | $(BIN)/python
+	$(BIN)/python -m pip install --quiet "$$($(BIN)/python -c 'import sys; print("$(TORCH)" if sys.version_info[:2] == (3, 11) else "torch")')"
+	@touch $@
+
+$(VENV)/.installed: pyproject.toml Makefile | $(VENV)/.torch
+	$(BIN)/python -m pip install --quiet -e ".[$(EXTRAS)]"
+	@touch $@

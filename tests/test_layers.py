@@ -1,0 +1,88 @@
+"""The order of the package: imports point only upwards in ARCHITECTURE's table."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import iga_drake
+
+PACKAGE = Path(iga_drake.__file__).parent
+
+# What each package may import from this one, itself aside.
+ALLOWED = {
+    "geometry": set(),
+    "shapes": {"geometry"},
+    "dataset": {"geometry", "shapes"},
+    "aligners": {"geometry"},
+    "training": {"geometry", "shapes", "dataset", "aligners"},
+    "systems": {"geometry", "aligners"},
+    "station": {"geometry", "aligners", "systems"},
+    "tasks": {"geometry", "shapes", "aligners", "systems", "station"},
+    "evaluation": {
+        "geometry", "shapes", "dataset", "aligners", "training", "systems", "station", "tasks",
+    },
+}  # fmt: skip
+# The contract between stations and systems: tables and values without behaviour, and the robot.
+CONTRACTS = {"iga_drake.station.ports", "iga_drake.station.scene", "iga_drake.station.panda"}
+# Usable by every package.
+ROOT_MODULES = {"iga_drake.errors", "iga_drake.paths"}
+WITHOUT_DRAKE = ("geometry", "shapes", "dataset", "aligners", "training")
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Every module of this package that `path` imports, lazily or not."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative imports hide the layers"
+            assert node.module
+            candidates = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {name for name in candidates if is_module(name)} or {node.module}
+    return {name for name in found if name.split(".")[0] == "iga_drake"}
+
+
+def is_module(name: str) -> bool:
+    path = PACKAGE.parent.joinpath(*name.split("."))
+    return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
+
+
+@pytest.mark.parametrize("package", ALLOWED)
+def test_imports_point_upwards(package: str):
+    wrong = []
+    for path in sorted((PACKAGE / package).rglob("*.py")):
+        for module in imported_modules(path):
+            parts = module.split(".")
+            if module in ROOT_MODULES | {"iga_drake"} or parts[1] in ALLOWED[package] | {package}:
+                continue
+            if package in ("systems", "tasks") and module in CONTRACTS:
+                continue
+            wrong.append(f"{path.relative_to(PACKAGE)} imports {module}")
+    assert not wrong
+
+
+def test_every_package_is_in_the_table():
+    packages = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    assert packages == set(ALLOWED)
+
+
+@pytest.mark.parametrize("package", WITHOUT_DRAKE)
+def test_learning_needs_neither_drake_nor_open3d(package: str):
+    """Imports every module of the package in a fresh interpreter."""
+    modules = [
+        ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
+        for path in sorted((PACKAGE / package).rglob("*.py"))
+        if path.name != "__main__.py"
+    ]
+    code = (
+        "import importlib, sys\n"
+        f"for name in {modules!r}: importlib.import_module(name)\n"
+        "heavy = {name.split('.')[0] for name in sys.modules} & {'pydrake', 'open3d'}\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
