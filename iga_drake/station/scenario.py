@@ -45,6 +45,15 @@ class Table:
 
 
 @dataclass
+class Panda:
+    """The robot in simulation."""
+
+    # What cameras and viewers see: "primitives" (simple shapes), "meshes" (the published meshes,
+    # needs the extra `visuals`), or "auto" (meshes where they can be had). Collisions are the same.
+    visuals: str = "auto"
+
+
+@dataclass
 class LookAt:
     """A camera pose given by where it stands and what it looks at; image "up" is W's +z."""
 
@@ -243,6 +252,7 @@ class Scenario:
 
     # Physics: time step (s), contact model and solver.
     plant: MultibodyPlantConfig = field(default_factory=_plant)
+    panda: Panda = field(default_factory=Panda)
     table: Table = field(default_factory=Table)
     # Name -> camera, at least one. A file that has this section states all cameras it wants.
     cameras: dict[str, Camera] = field(default_factory=_cameras)
@@ -363,6 +373,7 @@ def _wrong_type(where: str, expected: str, node: typing.Any) -> ScenarioError:
     return ScenarioError(f"{where}: expected {expected}, found {type(node).__name__} {node!r}")
 
 
+_PANDA_VISUALS = ("auto", "meshes", "primitives")
 # Drake itself looks at these names only when the plant is built.
 _PLANT_CHOICES = {
     "contact_model": ("point", "hydroelastic", "hydroelastic_with_fallback"),
@@ -389,6 +400,8 @@ def _check_values(s: Scenario) -> None:
     for key, valid in _PLANT_CHOICES.items():
         value = getattr(s.plant, key)
         need(value in valid, f"plant.{key}", value, ", ".join(valid))
+    look = s.panda.visuals
+    need(look in _PANDA_VISUALS, "panda.visuals", look, ", ".join(_PANDA_VISUALS))
     vector(s.table.size, "table.size")
     need(min(s.table.size) > 0, "table.size", s.table.size, "3 numbers > 0")
     vector(s.table.center, "table.center", 2)
