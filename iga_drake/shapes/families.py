@@ -61,7 +61,9 @@ def _loop_handle(rng: Rng, radius_at, low: float, high: float, reach: float) -> 
     tilt = np.array([0, 0, rng.uniform(-0.02, 0.04)])
     path = bezier(np.array([start, start + out + tilt, end + out * rng.uniform(0.6, 1.3), end]), 14)
     thick = rng.uniform(0.006, 0.016)
-    return tube(path, width=thick * rng.uniform(0.8, 2.0), height=thick, up=(0, 1, 0.01), segments=10)
+    return tube(
+        path, width=thick * rng.uniform(0.8, 2.0), height=thick, up=(0, 1, 0.01), segments=10
+    )
 
 
 def mug(rng: Rng) -> list[Surface]:
@@ -117,7 +119,9 @@ def bottle(rng: Rng) -> list[Surface]:
     cap = neck * rng.uniform(1.0, 1.35)
     r[7] = max(r[7], neck)
     r[8:] = (neck, neck, cap, cap)
-    profile = np.column_stack((np.concatenate(([0], r, [0])), np.concatenate(([0], z, [1])) * height))
+    profile = np.column_stack(
+        (np.concatenate(([0], r, [0])), np.concatenate(([0], z, [1])) * height)
+    )
     body = lathe(profile, segments=32, ratio=rng.uniform(0.55, 1.0), exponent=rng.uniform(2, 5))
     return [body]
 
@@ -147,7 +151,9 @@ def hammer(rng: Rng) -> list[Surface]:
     x = np.linspace(-back * reach, (1 - back) * reach, 14)
     droop = -rng.uniform(0, 0.04) * (np.clip(-x / reach, 0, 1)) ** 2
     head_path = np.column_stack((x, np.zeros(14), length - 0.01 + droop))
-    taper = np.interp(x, [x[0], -0.1 * reach, 0.1 * reach, x[-1]], [rng.uniform(0.15, 0.9), 0.8, 0.8, 1])
+    taper = np.interp(
+        x, [x[0], -0.1 * reach, 0.1 * reach, x[-1]], [rng.uniform(0.15, 0.9), 0.8, 0.8, 1]
+    )
     head = tube(head_path, width=face * rng.uniform(0.8, 1.3), height=face * taper,
                 exponent=rng.uniform(2, 5), segments=14)  # fmt: skip
     return [handle, head]
@@ -198,7 +204,9 @@ def chair(rng: Rng) -> list[Surface]:
     high, lean = rng.uniform(0.08, 0.18), rng.uniform(-0.3, 0.02)
     back = rounded_box((rng.uniform(0.01, 0.02), width * rng.uniform(0.7, 1), high), radius=0.0045)
     parts.append(
-        transform(back, _at((-depth / 2 + 0.008 + lean * high / 2, 0, seat + high / 2), _turn_y(lean)))
+        transform(
+            back, _at((-depth / 2 + 0.008 + lean * high / 2, 0, seat + high / 2), _turn_y(lean))
+        )
     )
     leg, splay = rng.uniform(0.01, 0.02), rng.uniform(0, 0.02)
     for sx in (-1, 1):
@@ -212,15 +220,15 @@ def chair(rng: Rng) -> list[Surface]:
 
 def lamp(rng: Rng) -> list[Surface]:
     base = rng.uniform(0.03, 0.06)
-    foot = lathe(np.array([[0, 0], [base, 0], [base, 0.008], [base * 0.5, 0.02], [0, 0.022]]), segments=28)
+    foot = lathe(
+        np.array([[0, 0], [base, 0], [base, 0.008], [base * 0.5, 0.02], [0, 0.022]]), segments=28
+    )
     height, reach = rng.uniform(0.12, 0.25), rng.uniform(0.0, 0.12)
     path = bezier(np.array([[0, 0, 0.01], [0, 0, height], [reach, 0, height]]), 16)
     pole = tube(path, width=rng.uniform(0.008, 0.016), height=0.01, up=(0, 1, 0), segments=10)
     top, low, high = rng.uniform(0.015, 0.04), rng.uniform(0.035, 0.07), rng.uniform(0.04, 0.08)
     outer = np.column_stack((np.linspace(top, low, 8), np.linspace(high, 0, 8)))[::-1]
-    shade = lathe(
-        np.concatenate(([[0, 0.0]], outer, [[0, high]])), segments=28
-    )
+    shade = lathe(np.concatenate(([[0, 0.0]], outer, [[0, high]])), segments=28)
     return [foot, pole, transform(shade, _at((reach, 0, height - high * 0.6)))]
 
 
@@ -228,10 +236,14 @@ def shoe(rng: Rng) -> list[Surface]:
     length, wide = rng.uniform(0.18, 0.3), rng.uniform(0.06, 0.1)
     t = np.linspace(0, 1, 20)
     ankle, toe = rng.uniform(0.06, 0.15), rng.uniform(0.03, 0.05)
-    height = np.interp(t, [0, 0.25, 0.45, 0.75, 1], [ankle * 0.9, ankle, (ankle + toe) / 2, toe * 1.15, toe])
+    height = np.interp(
+        t, [0, 0.25, 0.45, 0.75, 1], [ankle * 0.9, ankle, (ankle + toe) / 2, toe * 1.15, toe]
+    )
     width = wide * np.interp(t, [0, 0.3, 0.7, 0.9, 1], [0.65, 0.75, 1.0, 0.85, 0.5])
     path = np.column_stack((t * length, 0.01 * rng.uniform(-1, 1) * np.sin(2 * t), height / 2))
-    upper = tube(path, width=width, height=height, exponent=rng.uniform(2.2, 3.5), segments=20, up=(0, 0, 1))
+    upper = tube(
+        path, width=width, height=height, exponent=rng.uniform(2.2, 3.5), segments=20, up=(0, 0, 1)
+    )
     heel = rng.uniform(0.008, 0.03)
     outline = np.column_stack((np.concatenate((t, t[::-1])) * length,
                                np.concatenate((-width, width[::-1])) * 0.53))  # fmt: skip
@@ -241,13 +253,19 @@ def shoe(rng: Rng) -> list[Surface]:
 
 def basket(rng: Rng) -> list[Surface]:
     radius, height = rng.uniform(0.05, 0.1), rng.uniform(0.05, 0.12)
-    outer = np.column_stack((np.linspace(radius * rng.uniform(0.7, 0.95), radius, 8), np.linspace(0, height, 8)))
+    outer = np.column_stack(
+        (np.linspace(radius * rng.uniform(0.7, 0.95), radius, 8), np.linspace(0, height, 8))
+    )
     profile = shell_profile(outer, thickness=0.004, base_thickness=0.005)
     ratio = rng.uniform(0.55, 0.9)
-    body = lathe(getattr(profile, "profile", profile), segments=40, ratio=ratio, exponent=rng.uniform(2, 7))
+    body = lathe(
+        getattr(profile, "profile", profile), segments=40, ratio=ratio, exponent=rng.uniform(2, 7)
+    )
     rise = rng.uniform(0.05, 0.13)
     a = np.linspace(0, np.pi, 20)
-    path = np.column_stack((np.zeros(20), np.cos(a) * (radius * ratio - 0.003), height - 0.01 + rise * np.sin(a)))
+    path = np.column_stack(
+        (np.zeros(20), np.cos(a) * (radius * ratio - 0.003), height - 0.01 + rise * np.sin(a))
+    )
     handle = tube(path, width=rng.uniform(0.008, 0.025), height=0.007, up=(1, 0, 0.0), segments=10)
     return [body, handle]
 
@@ -262,7 +280,12 @@ def dustpan(rng: Rng) -> list[Surface]:
         parts.append(transform(wall, _at((0, s * wide / 2, side * 0.4))))
     start = np.array([length / 2, 0, side * rng.uniform(0.3, 0.9)])
     reach = rng.uniform(0.08, 0.16)
-    path = bezier(np.array([start, start + [reach / 2, 0, 0.0], start + [reach, 0, rng.uniform(-0.02, 0.06)]]), 12)
+    path = bezier(
+        np.array(
+            [start, start + [reach / 2, 0, 0.0], start + [reach, 0, rng.uniform(-0.02, 0.06)]]
+        ),
+        12,
+    )
     parts.append(tube(path, width=rng.uniform(0.018, 0.035), height=rng.uniform(0.012, 0.025), segments=12,
                       caps=(0.002, 0.01)))  # fmt: skip
     return parts
@@ -286,7 +309,11 @@ def cap(rng: Rng) -> list[Surface]:
 
 def hook_stand(rng: Rng) -> list[Surface]:
     base = rng.uniform(0.05, 0.09)
-    foot = prism(superellipse(32, rng.uniform(2, 8)) * [base, base * rng.uniform(0.7, 1)], bottom=0, top=0.015)
+    foot = prism(
+        superellipse(32, rng.uniform(2, 8)) * [base, base * rng.uniform(0.7, 1)],
+        bottom=0,
+        top=0.015,
+    )
     height = rng.uniform(0.18, 0.3)
     pole = tube(np.column_stack((np.zeros(10), np.zeros(10), np.linspace(0.01, height, 10))),
                 width=rng.uniform(0.012, 0.03), height=rng.uniform(0.012, 0.03), up=(1, 0, 0), segments=12)  # fmt: skip
@@ -303,8 +330,15 @@ def hook_stand(rng: Rng) -> list[Surface]:
 def screwdriver(rng: Rng) -> list[Surface]:
     grip, thick = rng.uniform(0.08, 0.13), rng.uniform(0.02, 0.04)
     z = np.linspace(0, 1, 12)
-    r = thick / 2 * (1 + rng.uniform(-0.25, 0.25) * np.sin(2 * np.pi * z)) * np.interp(z, [0, 0.1, 0.85, 1], [0.7, 1, 1, 0.6])
-    profile = np.column_stack((np.concatenate(([0], r, [0])), np.concatenate(([0], z * grip, [grip]))))
+    r = (
+        thick
+        / 2
+        * (1 + rng.uniform(-0.25, 0.25) * np.sin(2 * np.pi * z))
+        * np.interp(z, [0, 0.1, 0.85, 1], [0.7, 1, 1, 0.6])
+    )
+    profile = np.column_stack(
+        (np.concatenate(([0], r, [0])), np.concatenate(([0], z * grip, [grip])))
+    )
     handle = lathe(profile, segments=24, exponent=rng.uniform(2, 4))
     shaft = rng.uniform(0.06, 0.15)
     n = 10
@@ -319,21 +353,42 @@ def glasses_tray(rng: Rng) -> list[Surface]:
     """A tray with a raised end and a knob: no symmetry but its mirror plane."""
     length, wide, high = rng.uniform(0.14, 0.26), rng.uniform(0.08, 0.16), rng.uniform(0.012, 0.03)
     parts = [rounded_box((length, wide, high), radius=0.005)]
-    end = rounded_box((length * rng.uniform(0.1, 0.25), wide, rng.uniform(0.03, 0.08)), radius=0.005)
+    end = rounded_box(
+        (length * rng.uniform(0.1, 0.25), wide, rng.uniform(0.03, 0.08)), radius=0.005
+    )
     parts.append(transform(end, _at((length * 0.42, 0, 0.015))))
     ring = np.linspace(0, 2 * np.pi, 20, endpoint=False)
     radius = wide * rng.uniform(0.2, 0.4)
     loop = np.column_stack((np.cos(ring) * radius, np.sin(ring) * radius, np.full(20, high / 2)))
     thick = rng.uniform(0.006, 0.014)
-    parts.append(transform(ring_tube(loop, width=thick, height=thick, segments=8), _at((-length * 0.2, 0, 0))))
+    parts.append(
+        transform(
+            ring_tube(loop, width=thick, height=thick, segments=8), _at((-length * 0.2, 0, 0))
+        )
+    )
     return parts
 
 
 FAMILIES: dict[str, Callable[[Rng], list[Surface]]] = {
     f.__name__: f
     for f in (
-        mug, teapot, jug, bottle, spray_bottle, hammer, brush, ladle, chair, lamp, shoe, basket,
-        dustpan, cap, hook_stand, screwdriver, glasses_tray,
+        mug,
+        teapot,
+        jug,
+        bottle,
+        spray_bottle,
+        hammer,
+        brush,
+        ladle,
+        chair,
+        lamp,
+        shoe,
+        basket,
+        dustpan,
+        cap,
+        hook_stand,
+        screwdriver,
+        glasses_tray,
     )  # fmt: skip
 }
 

@@ -68,11 +68,12 @@ class LocalMoments(nn.Module):
         S = len(self.radii)
         distance = torch.cdist(p, x)[:, :, None]  # (B, M, 1, P)
         r = self.radii[:, None]
-        window = torch.exp(-((distance - r) ** 2) / (2 * (0.4 * r) ** 2))  # (B, M, S, P)
+        # Compact window of each shell: (1 - ((d - r) / 0.9 r)^2)_+^2, in place (no parameters).
+        window = ((distance - r) / (0.9 * r)).square_().neg_().add_(1).clamp_min_(0).square_()
         outer = (x[..., :, None] * x[..., None, :]).flatten(2)
         moments = window.flatten(1, 2) @ torch.cat((torch.ones_like(x[..., :1]), x, outer), -1)
-        moments = moments.reshape(B, M, S, 13)
-        mass = moments[..., :1].clamp_min(1e-3)
+        moments = moments.reshape(B, M, S, 13) / x.shape[1]
+        mass = moments[..., :1].clamp_min(1e-5)
         mean = moments[..., 1:4] / mass
         second = (moments[..., 4:] / mass).reshape(B, M, S, 3, 3)
         q = p[:, :, None]
@@ -89,7 +90,7 @@ class LocalMoments(nn.Module):
         cross = torch.linalg.cross(v, w, dim=-2)
         invariants = torch.cat(
             (
-                mass[..., 0].log(),
+                0.3 * mass[..., 0].log(),
                 offset.square().sum(-1),
                 -(offset * q).sum(-1),
                 second.diagonal(dim1=-2, dim2=-1).sum(-1),
