@@ -1,0 +1,191 @@
+"""Differential inverse kinematics: a moving end-effector pose becomes joint angles."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform
+from pydrake.multibody.inverse_kinematics import DifferentialInverseKinematicsSystem
+from pydrake.multibody.math import SpatialVelocity
+from pydrake.planning import DofMask, JointLimits
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.primitives import AffineSystem, BusCreator, DiscreteTimeIntegrator, MatrixGain
+
+from iga_drake.errors import IgaDrakeError
+from iga_drake.systems.planning_robot import PlanningRobot
+
+_System = DifferentialInverseKinematicsSystem
+_WISH = -0.05  # m or rad
+
+
+@dataclass(frozen=True)
+class DifferentialIkConfig:
+    """How fast and how close to its limits the arm may move."""
+
+    # Period of the commands (s).
+    time_step: float = 0.005
+    # Time (s) over which the solver looks ahead: a pose error is left to decay at this time
+    # constant, and a clearance or a step too far likewise.
+    horizon: float = 0.03
+    # Largest speeds of E (rad/s, m/s).
+    angular_velocity: float = 2.0
+    linear_velocity: float = 0.6
+    # Share of the joints' velocity limits that is used, in (0, 1].
+    velocity_scale: float = 0.9
+    # Distance to a joint's limit where it stops, and where it starts to slow down (rad).
+    position_margin: float = 0.03
+    position_influence: float = 0.2
+    # Distance from which on obstacles count (m).
+    collision_influence: float = 0.05
+    # Rate at which the null space moves to the nominal posture (1/s).
+    posture_gain: float = 2.0
+    # Weight of the pose error against the posture.
+    pose_weight: float = 100.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.velocity_scale <= 1.0:
+            raise IgaDrakeError(
+                f"DifferentialIkConfig.velocity_scale is {self.velocity_scale}: give a value in "
+                "(0, 1]"
+            )
+        if not 0.0 < self.time_step <= self.horizon:
+            raise IgaDrakeError(
+                f"DifferentialIkConfig: time_step {self.time_step} s has to be positive and at "
+                f"most the horizon, {self.horizon} s"
+            )
+
+
+class DifferentialIk(Diagram):
+    """Drake's differential inverse kinematics for one arm, with a pose as its input.
+
+    .. pydrake_system::
+
+        name: DifferentialIk
+        input_ports:
+        - desired_pose
+        - nominal_posture
+        output_ports:
+        - position
+        - velocity
+
+    - `desired_pose` (RigidTransform): X_WE that the end effector should have now.
+    - `nominal_posture` (N, rad): where the null space is pulled.
+    - `position` (N, rad): commanded joint angles, integrated in discrete state.
+    - `velocity` (N, rad/s): the commanded joint velocities behind them.
+
+    The commands respect the joints' position and velocity limits and keep links apart from each
+    other and from the table by the robot's safety distance; where these forbid the desired motion,
+    the arm goes as far as they allow and stays there. Call `set_initial_position` before
+    simulating.
+    """
+
+    def __init__(self, robot: PlanningRobot, config: DifferentialIkConfig | None = None) -> None:
+        super().__init__()
+        config = config or DifferentialIkConfig()
+        self._robot = robot
+        checker, frame = robot.checker, robot.frame_E.scoped_name().get_full()
+        speed = np.repeat([config.angular_velocity, config.linear_velocity], 3)
+
+        recipe = _System.Recipe()
+        recipe.AddIngredient(
+            _System.LeastSquaresCost(
+                _System.LeastSquaresCost.Config(cartesian_qp_weight=config.pose_weight)
+            )
+        )
+        recipe.AddIngredient(
+            _System.JointCenteringCost(
+                _System.JointCenteringCost.Config(posture_gain=config.posture_gain)
+            )
+        )
+        recipe.AddIngredient(
+            _System.CartesianVelocityLimitConstraint(
+                _System.CartesianVelocityLimitConstraint.Config(V_next_TG_limit=speed)
+            )
+        )
+        # All joints take part in the program and those that don't move get a velocity limit of zero
+        # and a wish to move. So there is always an active constraint, without which the solver
+        # (OSQP) prints a line to stdout at every step.
+        count, moving = len(robot.position_default), robot.indices
+        limits = JointLimits(plant=checker.plant())
+        moves = np.zeros(count)
+        moves[moving] = 1.0
+        recipe.AddIngredient(
+            _System.JointVelocityLimitConstraint(
+                config=_System.JointVelocityLimitConstraint.Config(
+                    min_margin=config.position_margin, influence_margin=config.position_influence
+                ),
+                joint_limits=JointLimits(
+                    position_lower=limits.position_lower(),
+                    position_upper=limits.position_upper(),
+                    velocity_lower=moves * config.velocity_scale * limits.velocity_lower(),
+                    velocity_upper=moves * config.velocity_scale * limits.velocity_upper(),
+                    acceleration_lower=limits.acceleration_lower(),
+                    acceleration_upper=limits.acceleration_upper(),
+                ),
+            )
+        )
+        recipe.AddIngredient(
+            _System.CollisionConstraint(
+                _System.CollisionConstraint.Config(
+                    safety_distance=robot.safety_distance,
+                    influence_distance=config.collision_influence,
+                )
+            )
+        )
+
+        builder = DiagramBuilder()
+        solver = builder.AddNamedSystem(
+            "solver",
+            _System(
+                recipe=recipe,
+                task_frame="world",
+                collision_checker=checker,
+                active_dof=DofMask(count, True),
+                time_step=config.horizon,
+                K_VX=1.0,
+                Vd_TG_limit=SpatialVelocity(speed),
+            ),
+        )
+        self._integrator = builder.AddNamedSystem(
+            "integrator", DiscreteTimeIntegrator(len(robot.indices), config.time_step)
+        )
+
+        poses = builder.AddNamedSystem("poses", BusCreator())
+        pose_input = poses.DeclareAbstractInputPort(frame, Value(RigidTransform()))
+        builder.ExportInput(pose_input, "desired_pose")
+        builder.Connect(poses.get_output_port(), solver.GetInputPort("desired_cartesian_poses"))
+
+        # The solver takes positions of the whole plant: the hand's are constant.
+        spread = np.zeros((count, len(moving)))
+        spread[moving, np.arange(len(moving))] = 1.0
+        others = robot.full(np.zeros(len(moving)))
+        wished = others + _WISH * (1.0 - moves)
+        for port, source, offset in (
+            ("position", self._integrator, others),
+            ("nominal_posture", None, wished),
+        ):
+            whole = builder.AddNamedSystem(f"whole_{port}", AffineSystem(D=spread, y0=offset))
+            if source is None:
+                builder.ExportInput(whole.get_input_port(), port)
+            else:
+                builder.Connect(source.get_output_port(), whole.get_input_port())
+            builder.Connect(whole.get_output_port(), solver.GetInputPort(port))
+        velocity = builder.AddNamedSystem("velocity", MatrixGain(spread.T))
+        builder.Connect(solver.get_output_port(), velocity.get_input_port())
+        builder.Connect(velocity.get_output_port(), self._integrator.get_input_port())
+
+        builder.ExportOutput(self._integrator.get_output_port(), "position")
+        builder.ExportOutput(velocity.get_output_port(), "velocity")
+        builder.BuildInto(self)
+        self.set_name("DifferentialIk")
+
+    def set_initial_position(self, root_context: Context, q: np.ndarray) -> None:
+        """Sets the joint angles (rad) from which the commands start, in the root's context."""
+        q = np.asarray(q, dtype=float)
+        if q.shape != (len(self._robot.indices),) or not np.isfinite(q).all():
+            raise IgaDrakeError(
+                f"DifferentialIk: initial position {q} has to be {len(self._robot.indices)} finite "
+                "angles in rad"
+            )
+        context = self._integrator.GetMyMutableContextFromRoot(root_context)
+        self._integrator.set_integral_value(context, q)

@@ -1,0 +1,53 @@
+"""A robot as inverse kinematics sees it: geometry, limits and the joints that may move."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.multibody.tree import Frame
+from pydrake.planning import DofMask, JointLimits, SceneGraphCollisionChecker
+
+
+@dataclass(frozen=True)
+class PlanningRobot:
+    """One arm with its surroundings, apart from any simulated plant.
+
+    The checker has no paddings: where a padded distance is negative and the real one isn't, Drake's
+    clearance gradients have the wrong sign.
+    """
+
+    checker: SceneGraphCollisionChecker
+    # Distance (m) that links keep from each other and from their surroundings.
+    safety_distance: float
+    # The end-effector frame E, welded to the arm's last link.
+    frame_E: Frame
+    # Which of the plant's positions the arm moves; the others (the hand's) stay.
+    active: DofMask
+    # All positions of the plant, the active ones in a comfortable posture.
+    position_default: np.ndarray
+
+    @property
+    def indices(self) -> np.ndarray:
+        """Indices of the active joints among the plant's positions."""
+        return np.flatnonzero([self.active[i] for i in range(self.active.size())])
+
+    @property
+    def limits(self) -> JointLimits:
+        """Limits of the active joints (rad, rad/s, rad/s^2)."""
+        return JointLimits(plant=self.checker.plant(), active_dof=self.active)
+
+    @property
+    def home(self) -> np.ndarray:
+        """The comfortable posture of the active joints (rad)."""
+        return self.position_default[self.indices]
+
+    def full(self, q: np.ndarray) -> np.ndarray:
+        """All positions of the plant with the active ones at `q`."""
+        position = self.position_default.copy()
+        position[self.indices] = q
+        return position
+
+    def clearance(self, q: np.ndarray, influence: float = 1.0) -> float:
+        """Least distance (m) between any two bodies with the active joints at `q`; `influence` if
+        nothing is nearer than that."""
+        distances = self.checker.CalcRobotClearance(self.full(q), influence).distances()
+        return float(distances.min()) if len(distances) else influence
