@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from iga_drake.aligners.checkpoint import load_checkpoint, save_checkpoint
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
+from iga_drake.aligners.iga.weights import DESCRIPTOR as KIND
+from iga_drake.aligners.iga.weights import descriptor_config
 from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.geometry.clouds import furthest_point_sampling
-from iga_drake.training.checkpoint import load_checkpoint, save_checkpoint
-
-KIND = "descriptor"
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def correspondence_loss(
         error = torch.gather(distance, -1, best)[..., 0][valid]
         hit = (best[..., 0] == distance.argmin(-1))[valid]
     return loss, {
-        "loss": float(loss),
+        "loss": float(loss.detach()),
         "top1": float(hit.float().mean()),
         "error_mean": float(error.mean()),
         "error_median": float(error.median()),
@@ -137,7 +137,7 @@ def train_descriptor(
     tensors: dict[str, Tensor] = {}
     if resume and state_path.is_file():
         tensors, card = load_checkpoint(state_path, kind=KIND + "-state")
-        model = _model_config(card)
+        model = descriptor_config(card)
         step, seconds = card["step"], card["seconds"]
     net = DescriptorNet(model or DescriptorConfig()).to(device)
     names = [name for name, _ in net.named_parameters()]
@@ -179,8 +179,10 @@ def train_descriptor(
         state = {f"net.{n}": p for n, p in net.named_parameters()}
         state |= {f"ema.{n}": t for n, t in ema.items()}
         for n, p in net.named_parameters():
-            state[f"m.{n}"] = optimizer.state[p]["exp_avg"]
-            state[f"v.{n}"] = optimizer.state[p]["exp_avg_sq"]
+            # The last layer's vectors feed nothing: they have no gradient and no moments.
+            moments = optimizer.state.get(p, {})
+            state[f"m.{n}"] = moments.get("exp_avg", torch.zeros_like(p))
+            state[f"v.{n}"] = moments.get("exp_avg_sq", torch.zeros_like(p))
         state["rng"] = torch.get_rng_state()
         save_checkpoint(state_path, state, kind=KIND + "-state", card=card)
         return card
@@ -218,17 +220,3 @@ def train_descriptor(
             card = write()
     return write()
 
-
-def _model_config(card: dict) -> DescriptorConfig:
-    fields = dict(card["model"])
-    fields["shells"] = tuple(fields["shells"])
-    return DescriptorConfig(**fields)
-
-
-def load_descriptor(path: Path) -> tuple[DescriptorNet, dict]:
-    """The trained network (evaluation mode) and its card."""
-    tensors, card = load_checkpoint(path, kind=KIND)
-    net = DescriptorNet(_model_config(card))
-    net.load_state_dict(tensors)
-    net.eval().requires_grad_(False)
-    return net, card

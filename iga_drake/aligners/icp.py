@@ -1,0 +1,104 @@
+"""The ICP baseline: registers a demonstration's objects with the test objects, rigidly.
+
+Per demonstration the grasped and the target cloud are registered with the test's (Open3D, multi-start,
+point-to-plane); with `X_A`, `X_B` from demonstration to test the answer is `X_B X_A^-1`. The best
+demonstration is the one with the smallest mean distance of both registrations.
+"""
+
+import numpy as np
+
+from iga_drake.aligners.protocol import Alignment, AlignerError, PoseEstimate, check_cloud
+
+
+def _open3d():
+    try:
+        import open3d
+    except ImportError as error:
+        raise AlignerError(
+            "icp: Open3D is not installed: pip install 'iga-drake[icp]' (needs libusb-1.0-0)"
+        ) from error
+    return open3d
+
+
+def _starts(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Rotations (count, 3, 3): the identity and Haar-uniform ones."""
+    from scipy.spatial.transform import Rotation
+
+    rotations = Rotation.random(count - 1, rng=rng).as_matrix()
+    return np.concatenate((np.eye(3)[None], rotations))
+
+
+class IcpAligner:
+    """`Aligner` by multi-start ICP. `starts` rotations, `refined` of them finished point-to-plane."""
+
+    name = "icp"
+
+    def __init__(self, *, starts: int = 24, refined: int = 3, voxel: float = 0.01):
+        self.starts = starts
+        self.refined = refined
+        self.voxel = voxel
+
+    def _register(self, source, goal, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+        """Motion (4, 4) of the source cloud onto the goal and the symmetric mean distance (m)."""
+        o3d = _open3d()
+        reg = o3d.pipelines.registration
+        coarse_s, coarse_g = (c.voxel_down_sample(self.voxel) for c in (source, goal))
+        centre_s, centre_g = (np.asarray(c.points).mean(0) for c in (source, goal))
+        trials = []
+        for R in _starts(self.starts, rng):
+            X = np.eye(4)
+            X[:3, :3] = R
+            X[:3, 3] = centre_g - R @ centre_s
+            result = reg.registration_icp(
+                coarse_s, coarse_g, 0.1, X, reg.TransformationEstimationPointToPoint(),
+                reg.ICPConvergenceCriteria(max_iteration=15),
+            )  # fmt: skip
+            trials.append((result.inlier_rmse, result.transformation))
+        trials.sort(key=lambda trial: trial[0])
+        best: tuple[float, np.ndarray] | None = None
+        for _, X in trials[: self.refined]:
+            result = reg.registration_icp(
+                source, goal, 0.03, X, reg.TransformationEstimationPointToPlane(),
+                reg.ICPConvergenceCriteria(max_iteration=40),
+            )  # fmt: skip
+            moved = o3d.geometry.PointCloud(source).transform(result.transformation)
+            distance = 0.5 * (
+                np.mean(moved.compute_point_cloud_distance(goal))
+                + np.mean(goal.compute_point_cloud_distance(moved))
+            )
+            if best is None or distance < best[0]:
+                best = (float(distance), np.asarray(result.transformation))
+        assert best is not None
+        return best[1], best[0]
+
+    def align(
+        self,
+        context: tuple[Alignment, ...],
+        grasped: np.ndarray,
+        target: np.ndarray,
+        *,
+        seed: int = 0,
+    ) -> PoseEstimate:
+        """See `Aligner.align`. One mode per demonstration; the energy is the mean distance in cm."""
+        if not context:
+            raise AlignerError("icp: the context is empty: give at least one demonstration")
+        o3d = _open3d()
+        rng = np.random.default_rng(seed)
+
+        def cloud(points: np.ndarray):
+            pcd = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+            pcd.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=0.02, max_nn=30))
+            return pcd
+
+        test_A = cloud(check_cloud(grasped, "grasped"))
+        test_B = cloud(check_cloud(target, "target"))
+        poses, energies = [], []
+        for alignment in context:
+            X_A, error_A = self._register(cloud(alignment.grasped), test_A, rng)
+            X_B, error_B = self._register(cloud(alignment.target), test_B, rng)
+            poses.append(X_B @ np.linalg.inv(X_A))
+            energies.append(100 * (error_A + error_B))
+        order = np.argsort(energies)
+        energy = np.array(energies)[order]
+        probability = np.exp(-(energy - energy[0]) / 0.1)
+        return PoseEstimate(np.array(poses)[order], energy, probability / probability.sum())

@@ -1,0 +1,24 @@
+"""Reads trained networks for inference."""
+
+from pathlib import Path
+
+from iga_drake.aligners.checkpoint import load_checkpoint
+from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
+
+DESCRIPTOR = "descriptor"
+
+
+def descriptor_config(card: dict) -> DescriptorConfig:
+    """The network's sizes as saved in a model card."""
+    fields = dict(card["model"])
+    fields["shells"] = tuple(fields["shells"])
+    return DescriptorConfig(**fields)
+
+
+def load_descriptor(path: Path) -> tuple[DescriptorNet, dict]:
+    """The trained network (evaluation mode) and its card; raises `CheckpointError`."""
+    tensors, card = load_checkpoint(path, kind=DESCRIPTOR)
+    net = DescriptorNet(descriptor_config(card))
+    net.load_state_dict(tensors)
+    net.eval().requires_grad_(False)
+    return net, card
