@@ -144,11 +144,12 @@ class PointCloudFusion(LeafSystem):
             points, labels, valid = self._unproject(name, depth.data, label.data, X_WC)
             number = {}
             for role, clouds in parts.items():
-                clouds.append(points[labels == role])
-                number[role] = len(clouds[-1])
+                mine = labels == role
+                clouds.append(points if mine.all() else points.compress(mine, axis=1))
+                number[role] = clouds[-1].shape[1]
             counts[name] = CameraCounts(valid, number[self._target], number[self._grasped])
         clouds = [
-            voxel_cloud(np.concatenate(parts[role]), self._voxel_size, self._min_cluster)
+            voxel_cloud(np.hstack(parts[role]).T, self._voxel_size, self._min_cluster)
             for role in (self._target, self._grasped)
         ]
         value.set_value(FusedClouds(*clouds, counts))
@@ -156,14 +157,14 @@ class PointCloudFusion(LeafSystem):
     def _unproject(
         self, name: str, depth: np.ndarray, label: np.ndarray, X_WC: RigidTransform
     ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Points (P, 3) in W and labels (P,) of one camera's good pixels; its valid pixels."""
+        """Points (3, P) in W and labels (P,) of one camera's good pixels; its valid pixels."""
         rays = self._rays[name]
         depth, label = depth[:, :, 0], label[:, :, 0]
         for kind, image in (("depth_image", depth), ("label_image", label)):
-            if image.shape != rays.shape[:2]:
+            if image.shape != rays[0].shape:
                 raise FusionError(
                     f"{name}.{kind}: {image.shape[1]} x {image.shape[0]} px, the camera's "
-                    f"intrinsics say {rays.shape[1]} x {rays.shape[0]} px"
+                    f"intrinsics say {rays[0].shape[1]} x {rays[0].shape[0]} px"
                 )
         valid = (depth > 0) & (depth < np.inf)
         wanted = (label == self._target) | (label == self._grasped)
@@ -171,7 +172,7 @@ class PointCloudFusion(LeafSystem):
         columns = np.flatnonzero(wanted.any(axis=0))
         number = int(np.count_nonzero(valid))
         if len(rows) == 0:
-            return np.zeros((0, 3), np.float32), np.zeros(0, np.int16), number
+            return np.zeros((3, 0), np.float32), np.zeros(0, np.int16), number
         # Only the part of the image that holds the objects, with a margin for the borders.
         margin = self._erosion + 1
         part = tuple(
@@ -182,13 +183,17 @@ class PointCloudFusion(LeafSystem):
         z = np.where(valid, depth, np.float32(np.nan))
         good = wanted[part] & valid
         good &= ~unreliable_pixels(z, label, jump=self._depth_jump, erosion=self._erosion)
-        p_C = rays[part][good] * z[good][:, None]
+        # Coordinate by coordinate: contiguous arrays, several times as fast as (P, 3) ones.
+        z, label = z[good], label[good]
+        x, y = (ray[part][good] * z for ray in rays)
         R = X_WC.rotation().matrix().astype(np.float32)
-        p_W = p_C @ R.T + X_WC.translation().astype(np.float32)
-        inside = np.ones(len(p_W), dtype=bool)
+        p = X_WC.translation().astype(np.float32)
+        p_W = np.empty((3, len(z)), dtype=np.float32)
+        inside = np.ones(len(z), dtype=bool)
         for axis in range(3):
-            inside &= (p_W[:, axis] >= self._lower[axis]) & (p_W[:, axis] <= self._upper[axis])
-        return p_W[inside], label[good][inside], number
+            p_W[axis] = R[axis, 0] * x + R[axis, 1] * y + R[axis, 2] * z + p[axis]
+            inside &= (p_W[axis] >= self._lower[axis]) & (p_W[axis] <= self._upper[axis])
+        return p_W.compress(inside, axis=1), label[inside], number
 
     def _cloud_output(self, name: str):
         def calc(context, output) -> None:
@@ -203,14 +208,12 @@ class PointCloudFusion(LeafSystem):
         output.set_value(dict(self._fused.Eval(context).counts))
 
 
-def pixel_rays(info: CameraInfo) -> np.ndarray:
-    """The point (x, y, 1) in the optical frame that each pixel sees at depth 1: (H, W, 3) float32.
+def pixel_rays(info: CameraInfo) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates x and y, at z = 1 in the optical frame, that each pixel sees: (H, W) float32.
 
     The centre of the first pixel is (0, 0).
     """
     x = (np.arange(info.width()) - info.center_x()) / info.focal_x()
     y = (np.arange(info.height()) - info.center_y()) / info.focal_y()
-    rays = np.ones((info.height(), info.width(), 3), dtype=np.float32)
-    rays[:, :, 0] = x[None, :]
-    rays[:, :, 1] = y[:, None]
-    return rays
+    grid = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
+    return np.ascontiguousarray(grid[0]), np.ascontiguousarray(grid[1])
