@@ -11,6 +11,7 @@ from iga_drake.systems.planning_robot import PlanningRobot
 
 _POSITION_TOLERANCE = 1e-5  # m
 _ROTATION_TOLERANCE = 1e-4  # rad
+_AVOIDING_STARTS = 3  # how often the slow program with distances is tried
 _SOLVER_TOLERANCE = 2e-3  # m and rad, before the last Newton steps
 
 
@@ -25,16 +26,13 @@ class PoseSolver:
         self,
         robot: PlanningRobot,
         *,
-        starts: int = 8,
+        starts: int = 20,
         position_margin: float = 0.05,
     ) -> None:
         """`starts`: number of starting postures. `position_margin`: distance (rad) that the angles
         keep from the joints' limits; at least that of the controller that follows."""
         self._robot = robot
         self._plant = robot.checker.plant()
-        root = robot.checker.model().CreateDefaultContext()
-        self._root_context = root  # keeps the plant's context alive
-        self._context = self._plant.GetMyMutableContextFromRoot(root)
         limits = robot.limits
         self._lower = limits.position_lower() + position_margin
         self._upper = limits.position_upper() - position_margin
@@ -48,8 +46,7 @@ class PoseSolver:
 
     def pose(self, q: np.ndarray) -> RigidTransform:
         """X_WE at the joint angles `q`."""
-        self._plant.SetPositions(self._context, self._robot.full(q))
-        return self._robot.frame_E.CalcPoseInWorld(self._context)
+        return self._robot.pose(q)
 
     def is_valid(self, q: np.ndarray) -> bool:
         """Whether `q` keeps the margins to the joints' limits and the safety distance."""
@@ -73,14 +70,16 @@ class PoseSolver:
             raise IgaDrakeError("PoseSolver: the pose X_WE holds values that are not finite")
         near = self._robot.home if near is None else np.asarray(near, dtype=float)
         starts = sorted(self._starts, key=lambda q: float(np.linalg.norm(q - near)))
+        colliding = []
         for start in [near, *starts]:
             start = np.clip(start, self._lower, self._upper)
             q = self._solve_from(X_WE, start, near, avoid=False)
-            if q is None:
-                continue
-            if self.is_valid(q):
+            if q is not None and self.is_valid(q):
                 return q
-            q = self._solve_from(X_WE, q, near, avoid=True)
+            if q is not None:
+                colliding.append(q)
+        for start in colliding[:_AVOIDING_STARTS]:
+            q = self._solve_from(X_WE, start, near, avoid=True)
             if q is not None and self.is_valid(q):
                 return q
         return None
@@ -93,7 +92,9 @@ class PoseSolver:
         self, X_WE: RigidTransform, start: np.ndarray, near: np.ndarray, *, avoid: bool
     ) -> np.ndarray | None:
         robot, plant = self._robot, self._plant
-        ik = InverseKinematics(plant, self._context, with_joint_limits=False)
+        root_context = robot.checker.model().CreateDefaultContext()
+        context = plant.GetMyMutableContextFromRoot(root_context)
+        ik = InverseKinematics(plant, context, with_joint_limits=False)
         program, position = ik.prog(), ik.q()
         active = position[robot.indices]
         others = np.setdiff1d(np.arange(len(position)), robot.indices)
@@ -129,8 +130,9 @@ class PoseSolver:
                 return q
             if max(rotation_error, position_error) > 0.1:
                 return None
+            context = self._robot.checker.UpdatePositions(self._robot.full(q))
             jacobian = plant.CalcJacobianSpatialVelocity(
-                self._context, JacobianWrtVariable.kQDot, frame, np.zeros(3), world, world
+                context, JacobianWrtVariable.kQDot, frame, np.zeros(3), world, world
             )[:, self._robot.indices]
             q = np.clip(q + np.linalg.pinv(jacobian) @ error, self._lower, self._upper)
         return None

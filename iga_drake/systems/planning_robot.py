@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from pydrake.math import RigidTransform
 from pydrake.multibody.tree import Frame
 from pydrake.planning import DofMask, JointLimits, SceneGraphCollisionChecker
 
@@ -45,6 +46,10 @@ class PlanningRobot:
         position = self.position_default.copy()
         position[self.indices] = q
         return position
+
+    def pose(self, q: np.ndarray) -> RigidTransform:
+        """X_WE with the active joints at `q`."""
+        return self.frame_E.CalcPoseInWorld(self.checker.UpdatePositions(self.full(q)))
 
     def clearance(self, q: np.ndarray, influence: float = 1.0) -> float:
         """Least distance (m) between any two bodies with the active joints at `q`; `influence` if

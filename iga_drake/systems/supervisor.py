@@ -1,0 +1,201 @@
+"""Supervisor: lets joint commands through while everything is within limits, else holds the arm."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from pydrake.common.value import AbstractValue, Value
+from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+
+from iga_drake.errors import IgaDrakeError
+from iga_drake.systems.messages import SupervisorStatus
+from iga_drake.systems.planning_robot import PlanningRobot
+
+
+@dataclass(frozen=True)
+class SupervisorConfig:
+    """What is allowed. Limits of the joints themselves come from the robot."""
+
+    # Period of the checks (s); a command is at most this late.
+    time_step: float = 0.005
+    # Share of the joints' velocity limits allowed, in the commands and as measured.
+    velocity_scale: float = 1.0
+    # Largest difference (rad) between command and measurement.
+    tracking_error: float = 0.2
+    # The box (m, in W) that E has to stay in.
+    workspace_lower: tuple[float, float, float] = (-0.2, -0.75, -0.01)
+    workspace_upper: tuple[float, float, float] = (0.85, 0.75, 1.0)
+    # Largest external torque at each joint (N m), and the time (s) it may be exceeded.
+    torque_limit: tuple[float, ...] = (40.0, 40.0, 40.0, 40.0, 10.0, 10.0, 10.0)
+    torque_time: float = 0.05
+
+
+@dataclass(frozen=True)
+class _Memory:
+    """What the supervisor remembers from one check to the next."""
+
+    position: np.ndarray | None = None  # last command that was good
+    time_overloaded: float | None = None  # since when the torque is too high (s)
+    status: SupervisorStatus = field(default_factory=SupervisorStatus)
+
+
+class Supervisor(LeafSystem):
+    """Passes joint commands on, or holds the arm at the last good one and says why.
+
+    .. pydrake_system::
+
+        name: Supervisor
+        input_ports:
+        - position_commanded
+        - position_measured
+        - velocity_measured
+        - torque_external
+        output_ports:
+        - position
+        - status
+
+    - `position_commanded` (N, rad), `position_measured` (N, rad), `velocity_measured` (N, rad/s),
+      `torque_external` (N, N m).
+    - `position` (N, rad): the command let through. Before the first check it is the command itself
+      if that is finite, else the measured position.
+    - `status` (SupervisorStatus): whether it holds, and the reason.
+
+    Checked each time step: values that aren't finite; the command's joint limits, its change since
+    the last one and its distance to the measured angles; the measured velocity; the commanded
+    position of E against a box; external torque. Holding is latched: it ends with a new context.
+    """
+
+    def __init__(self, robot: PlanningRobot, config: SupervisorConfig | None = None) -> None:
+        super().__init__()
+        self.set_name("Supervisor")
+        self._config = config = config or SupervisorConfig()
+        count = len(robot.indices)
+        if len(config.torque_limit) != count:
+            raise IgaDrakeError(
+                f"SupervisorConfig.torque_limit holds {len(config.torque_limit)} values, the robot "
+                f"has {count} joints"
+            )
+        self._robot, self._limits = robot, robot.limits
+        self._commanded_input = self.DeclareVectorInputPort("position_commanded", count)
+        self._position_input = self.DeclareVectorInputPort("position_measured", count)
+        self._velocity_input = self.DeclareVectorInputPort("velocity_measured", count)
+        self._torque_input = self.DeclareVectorInputPort("torque_external", count)
+        self._memory = self.DeclareAbstractState(Value[object](_Memory()))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(config.time_step, 0.0, self._update)
+        ticket = {self.abstract_state_ticket(self._memory)}
+        self.DeclareVectorOutputPort(
+            "position",
+            count,
+            self._calc_position,
+            ticket | {self._commanded_input.ticket(), self._position_input.ticket()},
+        )
+        self.DeclareAbstractOutputPort(
+            "status", lambda: Value[object](SupervisorStatus()), self._calc_status, ticket
+        )
+
+    def _first_position(self, context: Context) -> np.ndarray:
+        command = self._commanded_input.Eval(context)
+        return command if np.isfinite(command).all() else self._position_input.Eval(context)
+
+    def _update(self, context: Context, state: State) -> EventStatus:
+        memory: _Memory = context.get_abstract_state(int(self._memory)).get_value()
+        if memory.status.holding:
+            return EventStatus.DidNothing()
+        command = np.array(self._commanded_input.Eval(context))
+        torque = self._torque_input.Eval(context)
+        overloaded = None
+        if (np.abs(torque) > self._config.torque_limit).any():
+            overloaded = memory.time_overloaded
+            overloaded = context.get_time() if overloaded is None else overloaded
+        last = self._first_position(context) if memory.position is None else memory.position
+        reason = self._find_reason(
+            command=command,
+            last=last,
+            position=self._position_input.Eval(context),
+            velocity=self._velocity_input.Eval(context),
+            torque=torque,
+            overload_time=0.0 if overloaded is None else context.get_time() - overloaded,
+        )
+        if reason:
+            memory = replace(memory, position=last, status=SupervisorStatus(True, reason))
+        else:
+            memory = replace(memory, position=command, time_overloaded=overloaded)
+        state.get_mutable_abstract_state(int(self._memory)).set_value(memory)
+        return EventStatus.Succeeded()
+
+    def _find_reason(
+        self,
+        *,
+        command: np.ndarray,
+        last: np.ndarray,
+        position: np.ndarray,
+        velocity: np.ndarray,
+        torque: np.ndarray,
+        overload_time: float,
+    ) -> str:
+        """Why the arm has to be held; empty if nothing is wrong."""
+        config, limits = self._config, self._limits
+        for name, value in (
+            ("position_commanded", command),
+            ("position_measured", position),
+            ("velocity_measured", velocity),
+            ("torque_external", torque),
+        ):
+            if not np.isfinite(value).all():
+                return f"{name} isn't finite: {value}"
+        lower, upper = limits.position_lower(), limits.position_upper()
+        if (reason := _outside("commanded position", "rad", command, lower, upper)) or (
+            reason := _outside(
+                "commanded velocity",
+                "rad/s",
+                (command - last) / config.time_step,
+                config.velocity_scale * limits.velocity_lower() * (1 + 1e-6),
+                config.velocity_scale * limits.velocity_upper() * (1 + 1e-6),
+            )
+        ):
+            return reason
+        if reason := _outside(
+            "measured velocity",
+            "rad/s",
+            velocity,
+            config.velocity_scale * limits.velocity_lower(),
+            config.velocity_scale * limits.velocity_upper(),
+        ):
+            return reason
+        bound = np.full(len(command), config.tracking_error)
+        if reason := _outside("tracking error", "rad", command - position, -bound, bound):
+            return reason
+        p_WE = self._robot.pose(command).translation()
+        for axis, value, low, high in zip(
+            "xyz", p_WE, config.workspace_lower, config.workspace_upper, strict=True
+        ):
+            if not low <= value <= high:
+                return (
+                    f"commanded end effector leaves the workspace: {axis} = {value:.3f} m is "
+                    f"outside [{low:.3f}, {high:.3f}]"
+                )
+        if overload_time >= config.torque_time:
+            joint = int(np.argmax(np.abs(torque) / config.torque_limit))
+            return (
+                f"external torque of {torque[joint]:.1f} N m at joint {joint + 1} is above "
+                f"{config.torque_limit[joint]:.1f} N m for {overload_time:.2f} s"
+            )
+        return ""
+
+    def _calc_position(self, context: Context, output: BasicVector) -> None:
+        position = context.get_abstract_state(int(self._memory)).get_value().position
+        output.SetFromVector(self._first_position(context) if position is None else position)
+
+    def _calc_status(self, context: Context, output: AbstractValue) -> None:
+        output.set_value(context.get_abstract_state(int(self._memory)).get_value().status)
+
+
+def _outside(name: str, unit: str, value: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> str:
+    """Says which joint's `value` is outside of its bounds; empty if none is."""
+    bad = np.flatnonzero((value < lower) | (value > upper))
+    if len(bad) == 0:
+        return ""
+    joint = int(bad[0])
+    return (
+        f"{name} of joint {joint + 1} is {value[joint]:.3f} {unit}, outside "
+        f"[{lower[joint]:.3f}, {upper[joint]:.3f}]"
+    )
