@@ -68,19 +68,42 @@ def _simulate(arguments: argparse.Namespace) -> int:
     from iga_drake.station.scenario import load_scenario
     from iga_drake.tasks.episode import run_episode
 
-    path = scenario_path(arguments.scenario)
-    scenario = load_scenario(path)
-    if arguments.meshcat:
-        scenario.visualization.meshcat = True
+    scenario = load_scenario(scenario_path(arguments.scenario))
+    live = arguments.meshcat or scenario.visualization.meshcat
+    meshcat = None
+    if live or arguments.html:
+        from iga_drake.station.meshcat import start_meshcat
+
+        meshcat = start_meshcat(scenario.visualization)
+        meshcat.StartRecording(set_visualizations_while_recording=live)
+        if live:
+            print(f"meshcat: {meshcat.web_url()}", flush=True)
     result = run_episode(
         scenario,
         seed=arguments.seed,
         aligner=arguments.aligner,
         split=arguments.split,
-        html=arguments.html,
+        meshcat=meshcat,
+        on_event=lambda line: print(line, flush=True),
     )
+    if meshcat is not None:
+        from iga_drake.evaluation.replay import show_prediction, write_html
+
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+        show_prediction(
+            meshcat,
+            target=result.target_points,
+            grasped_E=result.grasped_points,
+            X_WE=result.X_WE_predicted,
+        )
+        if arguments.html:
+            write_html(meshcat, arguments.html)
+            print(f"replay: {arguments.html}")
     if arguments.result:
         write_text(arguments.result, json.dumps(result.row()) + "\n")
+    if live and sys.stdin.isatty():
+        input("press Enter to end")
     return SUCCESS if result.success else FAILURE
 
 

@@ -133,7 +133,21 @@ def add_panda(
     (instance,) = parser.AddModelsFromString(_urdf_text(visuals, plant.time_step() > 0), "urdf")
     base = plant.GetBodyByName("panda_link0", instance)
     plant.WeldFrames(plant.world_frame(), base.body_frame(), X_WB or RigidTransform())
-    model = PandaModel(
+    model = find_panda(plant, instance)
+    if controlled:
+        plant.set_gravity_enabled(instance, False)
+        for actuator in model.arm_actuators:
+            actuator.set_controller_gains(_ARM_GAINS)
+        for actuator in model.finger_actuators:
+            actuator.set_controller_gains(_FINGER_GAINS)
+    return model
+
+
+def find_panda(plant: MultibodyPlant, instance: ModelInstanceIndex | None = None) -> PandaModel:
+    """The Panda that `add_panda` put into `plant`; `instance` where the plant holds several."""
+    if instance is None:
+        instance = plant.GetBodyByName("panda_link0").model_instance()
+    return PandaModel(
         plant=plant,
         instance=instance,
         arm_joints=tuple(
@@ -151,19 +165,12 @@ def add_panda(
         ),
         frame_hand=plant.GetFrameByName("panda_hand", instance),
         frame_E=plant.GetFrameByName("panda_tcp", instance),
-        base_body=base,
+        base_body=plant.GetBodyByName("panda_link0", instance),
         hand_body=plant.GetBodyByName("panda_hand", instance),
         finger_bodies=tuple(
             plant.GetBodyByName(f"panda_{side}finger", instance) for side in ("left", "right")
         ),
     )
-    if controlled:
-        plant.set_gravity_enabled(instance, False)
-        for actuator in model.arm_actuators:
-            actuator.set_controller_gains(_ARM_GAINS)
-        for actuator in model.finger_actuators:
-            actuator.set_controller_gains(_FINGER_GAINS)
-    return model
 
 
 def _urdf_text(visuals: Visuals, couple_fingers: bool) -> str:

@@ -45,10 +45,11 @@ class IgaPolicy(LeafSystem):
         - target_observed
         - grasped_observed
 
-    `target` is an `EndEffectorTarget`, `status` a `PolicyStatus` (phase, timeline, reason),
-    `estimate` a `PoseEstimate` or None, `energy` the energy of the chosen pose (NaN before there is
-    one), `target_observed` the observed target cloud in W, `grasped_observed` the grasped cloud in
-    E that the aligner was given.
+    `camera_counts` is a dict of camera name -> value with `valid`, the pixels with a depth.
+    `target` is an `EndEffectorTarget`, or None while the arm has not been asked to move; `status` a
+    `PolicyStatus` (phase, timeline, reason), `estimate` a `PoseEstimate` or None, `energy` the
+    energy of the chosen pose (NaN before there is one), `target_observed` the observed target cloud
+    in W, `grasped_observed` the grasped cloud in E that the aligner was given.
     """
 
     def __init__(self, machine: PolicyMachine) -> None:
@@ -57,9 +58,7 @@ class IgaPolicy(LeafSystem):
         cloud = Value[PointCloud]()
         self._target_cloud_input = self.DeclareAbstractInputPort("target_cloud", cloud)
         self._grasped_cloud_input = self.DeclareAbstractInputPort("grasped_cloud", cloud)
-        self._counts_input = self.DeclareAbstractInputPort(
-            "camera_counts", AbstractValue.Make(object())
-        )
+        self._counts_input = self.DeclareAbstractInputPort("camera_counts", AbstractValue.Make({}))
         self._pose_input = self.DeclareAbstractInputPort("pose_measured", Value[RigidTransform]())
         self._position_input = self.DeclareVectorInputPort("panda.position_measured", PANDA_JOINTS)
         self._follower_input = self.DeclareAbstractInputPort(
@@ -80,7 +79,7 @@ class IgaPolicy(LeafSystem):
                 name, lambda: AbstractValue.Make(example), calc, prerequisites_of_calc=state
             )
 
-        declare("target", start.target, lambda memory: memory.target)
+        declare("target", None, lambda m: m.target if m.target.sequence > 0 else None)
         declare("status", start.status, lambda memory: memory.status)
         declare("estimate", None, lambda memory: memory.estimate)
         declare("target_observed", PointCloud(), lambda m: to_point_cloud(m.target_points))
@@ -124,7 +123,7 @@ class _Pull:
         port = self._policy._counts_input
         if not port.HasValue(self._context):
             return ()
-        return self._read(port).silent
+        return tuple(name for name, counts in self._read(port).items() if counts.valid == 0)
 
     def pose(self) -> RigidTransform:
         return self._read(self._policy._pose_input)

@@ -32,15 +32,15 @@ class ReachesAtOnce(LeafSystem):
 
     def __init__(self, policy: IgaPolicy) -> None:
         super().__init__()
-        target = policy.GetOutputPort("target").Allocate()
-        self._input = self.DeclareAbstractInputPort("target", target)
+        self._input = self.DeclareAbstractInputPort("target", AbstractValue.Make(None))
         index = self.DeclareAbstractState(AbstractValue.Make(FollowerStatus()))
         self.DeclareStateOutputPort("status", index)
         self.DeclarePeriodicUnrestrictedUpdateEvent(0.2, 0.1, self._update)
 
     def _update(self, context, state) -> None:
-        sequence = self._input.Eval(context).sequence
-        state.get_mutable_abstract_state(0).set_value(FollowerStatus(sequence_reached=sequence))
+        target = self._input.Eval(context)
+        reached = 0 if target is None else target.sequence
+        state.get_mutable_abstract_state(0).set_value(FollowerStatus(sequence_reached=reached))
 
 
 def build(aligner):
@@ -63,6 +63,7 @@ def test_runs_in_a_diagram_and_renders_only_while_observing():
     policy, cloud, simulator, context = build(aligner)
     assert np.isnan(policy.GetOutputPort("energy").Eval(context)[0])
     assert policy.GetOutputPort("estimate").Eval(context) is None
+    assert policy.GetOutputPort("target").Eval(context) is None
     simulator.AdvanceTo(0.4)
     assert cloud.count == 0, "the scene is still coming to rest"
     simulator.AdvanceTo(10.0)
