@@ -7,6 +7,7 @@ from pydrake.geometry import (
     ColorRenderCamera,
     DepthRange,
     DepthRenderCamera,
+    LightParameter,
     MakeRenderEngineVtk,
     RenderCameraCore,
     RenderEngineVtkParams,
@@ -50,7 +51,18 @@ def camera_info(intrinsics: Intrinsics) -> CameraInfo:
 
 def add_renderer(scene_graph: SceneGraph) -> None:
     """Adds the renderer that all cameras share; it needs no display."""
-    params = RenderEngineVtkParams(default_clear_color=[0.85, 0.87, 0.9], backend="EGL")
+    params = RenderEngineVtkParams(
+        default_clear_color=[0.85, 0.87, 0.9],
+        lights=[
+            LightParameter(
+                type="directional", frame="world", direction=[-0.3, 0.2, -1.0], intensity=0.9
+            ),
+            LightParameter(
+                type="directional", frame="camera", direction=[0.0, 0.0, 1.0], intensity=0.6
+            ),
+        ],
+        backend="EGL",
+    )
     scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(params))
 
 
