@@ -7,6 +7,7 @@ what was found and what to do).
 import argparse
 import importlib
 import json
+import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -283,6 +284,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if others and parsed.command not in DELEGATES:
         parser.error(f"unrecognized arguments: {' '.join(others)}")
     parsed.options = others
+    logging.getLogger("drake").setLevel(logging.WARNING)
     try:
         return COMMANDS[parsed.command][2](parsed)
     except IgaDrakeError as error:

@@ -15,7 +15,7 @@ from iga_drake.aligners.demonstration import (
     DemonstrationSet,
     read_demonstrations,
 )
-from iga_drake.aligners.protocol import Alignment, PoseEstimate
+from iga_drake.aligners.protocol import Aligner, AlignerError, Alignment, PoseEstimate
 from iga_drake.aligners.registry import make_aligner
 from iga_drake.paths import models_dir
 from iga_drake.station.scenario import Scenario
@@ -132,7 +132,7 @@ def run_episode(
     scenario: Scenario,
     *,
     seed: int,
-    aligner: str | None = None,
+    aligner: str | Aligner | None = None,
     split: Split = "test",
     meshcat: Meshcat | None = None,
     on_event: Callable[[str], None] = print,
@@ -142,7 +142,7 @@ def run_episode(
     Args:
       scenario: how the diagram is wired.
       seed: decides scene, camera noise and the aligner's random choices.
-      aligner: name of an aligner, or "expert"; default: the scenario's.
+      aligner: an aligner or the name of one, or "expert"; default: the scenario's.
       split: whose objects: "test" (never demonstrated) or "demonstration".
       meshcat: where to show it.
       on_event: called with one line of text for each phase and with the verdict.
@@ -151,17 +151,12 @@ def run_episode(
       IgaDrakeError: bad input. An episode that fails is a result, not an error.
     """
     began = wall.perf_counter()
-    name = aligner or scenario.aligner.name
     task = make_task(scenario.task.name)
+    chosen = _choose_aligner(scenario, aligner)
     demonstrations = None
-    chosen: Any
-    if name == EXPERT:
-        chosen = ExpertAligner()
-    else:
+    if chosen.name != EXPERT:
         demonstrations = read_demonstrations(demonstrations_path(scenario), task=task.name)
         demonstrations = demonstrations.first(min(CONTEXT_SIZE, len(demonstrations)))
-        same = name == scenario.aligner.name
-        chosen = make_aligner(name, **(scenario.aligner.options if same else {}))
     episode = build_episode_diagram(
         scenario,
         task=task,
@@ -173,15 +168,30 @@ def run_episode(
     )
     if isinstance(chosen, ExpertAligner):
         chosen.pose = lambda: _expert_pose(task, episode, episode.snapshot())
-    on_event(f"{task.name}, seed {seed}, aligner {name}, {split} objects")
+    on_event(f"{task.name}, seed {seed}, aligner {chosen.name}, {split} objects")
     return _run(
-        EpisodeResult(task=task.name, aligner=name, seed=seed, split=split, success=False),
+        EpisodeResult(task=task.name, aligner=chosen.name, seed=seed, split=split, success=False),
         task,
         episode,
         time_limit=scenario.task.time_limit,
         build_seconds=wall.perf_counter() - began,
         on_event=on_event,
     )
+
+
+def _choose_aligner(scenario: Scenario, aligner: str | Aligner | None) -> Aligner:
+    name = scenario.aligner.name if aligner is None else aligner
+    if not isinstance(name, str):
+        return name
+    if name == EXPERT:
+        return ExpertAligner()
+    options = scenario.aligner.options if name == scenario.aligner.name else {}
+    try:
+        return make_aligner(name, **options)
+    except TypeError as error:
+        raise AlignerError(
+            f"aligner.options {options}: '{name}' does not take them: {error}"
+        ) from error
 
 
 def _expert_pose(task: Task, episode: EpisodeDiagram, snapshot: Snapshot) -> RigidTransform:

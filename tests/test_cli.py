@@ -1,0 +1,129 @@
+"""The `iga` command: exit statuses and one-line errors."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from demonstration_fakes import make_set
+
+from iga_drake import cli
+from iga_drake.aligners.demonstration import write_demonstrations
+from iga_drake.paths import diagrams_dir
+
+
+def refused(capsys: pytest.CaptureFixture, *arguments: str) -> str:
+    """Runs `iga`, checks for exit status 2 and a single line, and returns it."""
+    assert cli.main(arguments) == cli.BAD_INPUT
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1, captured.err
+    assert captured.err.startswith(f"iga {arguments[0]}: ")
+    return captured.err
+
+
+def test_a_missing_scenario_lists_the_ones_there_are(capsys):
+    line = refused(capsys, "simulate", "nowhere.yaml")
+    assert "nowhere.yaml: no such file" in line
+    assert "grasp" in line and "stack" in line
+
+
+def test_an_unknown_key_lists_the_valid_ones(capsys, tmp_path: Path):
+    path = tmp_path / "scenario.yaml"
+    path.write_text("task:\n  name: grasp\n  goal: tea\n")
+    line = refused(capsys, "simulate", str(path))
+    assert "goal" in line and "time_limit" in line and str(path) in line
+
+
+def test_an_unknown_task_lists_the_valid_ones(capsys, tmp_path: Path):
+    path = tmp_path / "scenario.yaml"
+    path.write_text("task: {name: juggle}\n")
+    line = refused(capsys, "simulate", str(path))
+    assert "juggle" in line and "grasp" in line and "stack" in line
+
+
+def scenario_with(tmp_path: Path, demonstrations: Path) -> str:
+    text = (diagrams_dir() / "grasp.yaml").read_text()
+    text = text.replace("demonstrations: demonstrations/grasp", f"demonstrations: {demonstrations}")
+    path = tmp_path / "scenario.yaml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_missing_demonstrations(capsys, tmp_path: Path):
+    scenario = scenario_with(tmp_path, tmp_path / "none")
+    assert "manifest.json" in refused(capsys, "simulate", scenario, "--aligner", "icp")
+
+
+def test_truncated_demonstrations(capsys, tmp_path: Path):
+    write_demonstrations(tmp_path / "demos", make_set())
+    path = tmp_path / "demos" / "demonstration_0.safetensors"
+    path.write_bytes(path.read_bytes()[:-100])
+    scenario = scenario_with(tmp_path, tmp_path / "demos")
+    html, result = tmp_path / "out.html", tmp_path / "result.json"
+    line = refused(
+        capsys, "simulate", scenario, "--aligner", "icp", "--html", str(html), "--result",
+        str(result),
+    )  # fmt: skip
+    assert "demonstration_0.safetensors" in line
+    assert not html.exists() and not result.exists()
+
+
+def test_demonstrations_of_another_version(capsys, tmp_path: Path):
+    write_demonstrations(tmp_path / "demos", make_set())
+    path = tmp_path / "demos" / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"version": 99}))
+    assert "version 99 found" in refused(capsys, "view", "demonstrations", str(tmp_path / "demos"))
+
+
+def test_view_writes_a_page(capsys, tmp_path: Path):
+    write_demonstrations(tmp_path / "demos", make_set())
+    page = tmp_path / "pages" / "demos.html"
+    arguments = ("view", "demonstrations", str(tmp_path / "demos"), "--html", str(page))
+    assert cli.main(arguments) == cli.SUCCESS
+    assert page.read_text().lstrip().lower().startswith("<!doctype html>")
+    assert "40 grasped points, 60 target points" in capsys.readouterr().out
+
+
+def test_evaluate_refuses_what_it_does_not_know(capsys):
+    assert "oracle: unknown" in refused(capsys, "evaluate", "tasks", "--aligner", "oracle")
+    assert "juggle: no such file" in refused(capsys, "evaluate", "tasks", "--tasks", "juggle")
+    assert "at least 1" in refused(capsys, "evaluate", "tasks", "--trials", "0")
+
+
+@pytest.mark.parametrize(
+    "arguments", [["simulate"], ["simulate", "grasp", "--aligner", "oracle"], ["fly"], []]
+)
+def test_bad_usage_has_exit_status_2(arguments: list[str]):
+    with pytest.raises(SystemExit) as exit_info:
+        cli.main(arguments)
+    assert exit_info.value.code == 2
+
+
+def test_scenarios_can_be_named():
+    assert cli.scenario_path("stack") == diagrams_dir() / "stack.yaml"
+    assert cli.scenario_path("stack.yaml") == diagrams_dir() / "stack.yaml"
+
+
+def test_text_is_written_whole_or_not_at_all(tmp_path: Path):
+    path = tmp_path / "new" / "file.txt"
+    cli.write_text(path, "old")
+    with pytest.raises(UnicodeEncodeError):
+        cli.write_text(path, "half \ud800")
+    assert path.read_text() == "old"
+    assert [p.name for p in path.parent.iterdir()] == ["file.txt"]
+
+
+def test_exit_status_follows_the_verdict(monkeypatch, tmp_path: Path):
+    from iga_drake.tasks import episode
+
+    def fake(scenario, *, seed, aligner, split, meshcat, on_event):
+        return episode.EpisodeResult(
+            task="grasp", aligner="icp", seed=seed, split=split, success=seed == 1,
+            target_points=np.zeros((0, 3)),
+        )  # fmt: skip
+
+    monkeypatch.setattr(episode, "run_episode", fake)
+    path = tmp_path / "result.json"
+    assert cli.main(["simulate", "grasp", "--seed", "1", "--result", str(path)]) == cli.SUCCESS
+    assert json.loads(path.read_text())["success"] is True
+    assert cli.main(["simulate", "grasp", "--seed", "2"]) == cli.FAILURE
