@@ -284,7 +284,7 @@ def load_scenario(path: str | Path) -> Scenario:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8") or "{}"
     except (OSError, UnicodeDecodeError) as e:
         raise ScenarioError(
             f"{path}: scenario can't be read ({e}): give the path of a .yaml"

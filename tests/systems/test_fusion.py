@@ -1,0 +1,217 @@
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.perception import DepthImageToPointCloud
+from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I
+from scipy.spatial import KDTree
+
+from iga_drake.systems.fusion import (
+    CameraCounts,
+    FusionError,
+    PointCloudFusion,
+    pixel_rays,
+    unreliable_pixels,
+)
+from iga_drake.systems.voxels import voxel_cloud
+
+INFO = CameraInfo(160, 120, 150.0, 155.0, 79.5, 59.5)
+SHAPE = (120, 160)
+# From 0.8 m above, looking straight down at the plane z = 0 of W; x right, y down in the image.
+ABOVE = RigidTransform(RollPitchYaw(np.pi, 0, 0), [0.4, 0.1, 0.8])
+
+
+def _depth(array: np.ndarray) -> ImageDepth32F:
+    image = ImageDepth32F(array.shape[1], array.shape[0])
+    image.mutable_data[:, :, 0] = array
+    return image
+
+
+def _label(array: np.ndarray) -> ImageLabel16I:
+    image = ImageLabel16I(array.shape[1], array.shape[0])
+    image.mutable_data[:, :, 0] = array
+    return image
+
+
+def _fuse(cameras: dict, **options):
+    """Clouds of target and grasped object (P, 3), counts; `cameras`: name -> (depth, label, X)."""
+    fusion = PointCloudFusion(dict.fromkeys(cameras, INFO), **options)
+    context = fusion.CreateDefaultContext()
+    for name, (depth, label, X_WC) in cameras.items():
+        fusion.GetInputPort(f"{name}.depth_image").FixValue(context, _depth(depth))
+        fusion.GetInputPort(f"{name}.label_image").FixValue(context, _label(label))
+        fusion.GetInputPort(f"{name}.pose").FixValue(context, X_WC)
+    clouds = [fusion.GetOutputPort(f"{n}_cloud").Eval(context) for n in ("target", "grasped")]
+    for cloud in clouds:
+        assert cloud.xyzs().dtype == np.float32
+    counts = fusion.GetOutputPort("camera_counts").Eval(context)
+    return clouds[0].xyzs().T, clouds[1].xyzs().T, counts
+
+
+def _plane_depth(X_WC: RigidTransform) -> np.ndarray:
+    """Analytic depth of the plane z = 0 of W."""
+    x, y = pixel_rays(INFO)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ X_WC.rotation().matrix().T
+    return (-X_WC.translation()[2] / rays[:, :, 2]).astype(np.float32)
+
+
+def _square() -> np.ndarray:
+    label = np.zeros(SHAPE, dtype=np.int16)
+    label[40:80, 50:110] = 1
+    return label
+
+
+@pytest.mark.parametrize("rpy", [(np.pi, 0, 0), (np.pi - 0.6, 0.2, 0.5), (np.pi + 0.5, -0.3, 2)])
+def test_a_plane_is_unprojected_to_the_plane(rpy):
+    X_WC = RigidTransform(RollPitchYaw(rpy), [0.4, 0.1, 0.8])
+    cloud, grasped, counts = _fuse({"c": (_plane_depth(X_WC), _square(), X_WC)}, depth_jump=0.1)
+    assert len(grasped) == 0
+    assert np.abs(cloud[:, 2]).max() < 1e-6
+    # The square without its border of one pixel.
+    assert counts == {"c": CameraCounts(valid=120 * 160, target=38 * 58, grasped=0)}
+
+
+def test_the_square_is_where_the_pinhole_says():
+    cloud, _, _ = _fuse(
+        {"c": (_plane_depth(ABOVE), _square(), ABOVE)}, voxel_size=0.002, min_cluster=1
+    )
+    # Pixel centres 51..108 and 41..78; y of the image is -y of W.
+    assert cloud[:, 0].min() == pytest.approx(0.4 + 0.8 * (51 - 79.5) / 150, abs=1e-6)
+    assert cloud[:, 0].max() == pytest.approx(0.4 + 0.8 * (108 - 79.5) / 150, abs=1e-6)
+    assert cloud[:, 1].max() == pytest.approx(0.1 - 0.8 * (41 - 59.5) / 155, abs=1e-6)
+    assert cloud[:, 1].min() == pytest.approx(0.1 - 0.8 * (78 - 59.5) / 155, abs=1e-6)
+
+
+def test_same_points_as_drake():
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(0.5, 1.0, SHAPE).astype(np.float32)
+    depth[rng.random(SHAPE) < 0.1] = np.inf
+    depth[rng.random(SHAPE) < 0.1] = 0.0
+    theirs = DepthImageToPointCloud(INFO)
+    context = theirs.CreateDefaultContext()
+    theirs.depth_image_input_port().FixValue(context, _depth(depth))
+    theirs.GetInputPort("camera_pose").FixValue(context, ABOVE)
+    points = theirs.point_cloud_output_port().Eval(context).xyzs().T
+    points = points[np.isfinite(points).all(axis=1)]
+    ours, _, counts = _fuse(
+        {"c": (depth, np.ones(SHAPE, np.int16), ABOVE)}, erosion=0, min_cluster=1
+    )
+    assert counts["c"].target == counts["c"].valid == len(points)
+    np.testing.assert_allclose(ours.mean(axis=0), points.mean(axis=0), atol=1e-3)
+    # The points' last bits differ, so a few lie in another voxel.
+    distance, _ = KDTree(voxel_cloud(points, 0.005)).query(ours)
+    assert (distance < 1e-6).mean() > 0.995
+
+
+def test_roles_are_kept_apart():
+    label = _square()
+    label[10:30, 20:60] = 2
+    label[90:110, 20:60] = 3  # the robot
+    target, grasped, counts = _fuse({"c": (_plane_depth(ABOVE), label, ABOVE)})
+    assert counts["c"].target == 38 * 58
+    assert counts["c"].grasped == 18 * 38
+    assert target[:, 1].max() < grasped[:, 1].min()
+
+
+def test_invalid_pixels_leave_no_points():
+    depth = _plane_depth(ABOVE)
+    depth[50, 60] = np.nan
+    depth[55, 65] = np.inf
+    depth[60, 70] = -np.inf
+    depth[65, 75] = 0.0
+    depth[70, 80] = -1.0
+    cloud, _, counts = _fuse({"c": (depth, _square(), ABOVE)})
+    assert np.isfinite(cloud).all()
+    assert np.abs(cloud[:, 2]).max() < 1e-6
+    assert counts["c"] == CameraCounts(valid=120 * 160 - 5, target=38 * 58 - 5, grasped=0)
+
+
+@pytest.mark.parametrize("nothing", [np.nan, np.inf, 0.0])
+def test_a_camera_that_delivers_nothing_is_recognised_and_the_others_work(nothing):
+    dead = np.full(SHAPE, nothing, dtype=np.float32)
+    alone, _, _ = _fuse({"a": (_plane_depth(ABOVE), _square(), ABOVE)})
+    cloud, _, counts = _fuse(
+        {"a": (_plane_depth(ABOVE), _square(), ABOVE), "b": (dead, _square(), ABOVE)}
+    )
+    np.testing.assert_array_equal(cloud, alone)
+    assert counts["a"].valid == 120 * 160
+    assert counts["b"] == CameraCounts(valid=0, target=0, grasped=0)
+
+
+def test_nothing_in_view_gives_empty_clouds():
+    none = np.zeros(SHAPE, dtype=np.int16)
+    target, grasped, counts = _fuse({"c": (_plane_depth(ABOVE), none, ABOVE)})
+    assert target.shape == grasped.shape == (0, 3)
+    assert counts["c"] == CameraCounts(valid=120 * 160, target=0, grasped=0)
+
+
+def test_flying_pixels_are_dropped():
+    """Pixels half-way between the object and the ground, along the object's outline."""
+    depth = _plane_depth(ABOVE)
+    depth[40:80, 50:110] -= 0.3
+    depth[40, 50:110] += 0.15
+    depth[40:80, 109] += 0.15
+    cloud, _, _ = _fuse({"c": (depth, _square(), ABOVE)}, depth_jump=0.02)
+    np.testing.assert_allclose(cloud[:, 2], 0.3, atol=1e-5)
+    rough, _, _ = _fuse({"c": (depth, _square(), ABOVE)}, erosion=0, min_cluster=1)
+    assert rough[:, 2].min() < 0.2
+
+
+@pytest.mark.parametrize("erosion", [1, 2, 3])
+def test_erosion_is_in_pixels(erosion):
+    _, _, counts = _fuse({"c": (_plane_depth(ABOVE), _square(), ABOVE)}, erosion=erosion)
+    assert counts["c"].target == (40 - 2 * erosion) * (60 - 2 * erosion)
+
+
+def test_a_missing_pixel_is_no_jump():
+    depth = np.full((20, 20), 0.5, dtype=np.float32)
+    depth[10, 10] = np.nan
+    label = np.zeros((20, 20), dtype=np.int16)
+    assert not unreliable_pixels(depth, label, jump=0.02, erosion=2).any()
+
+
+def test_specks_and_points_outside_the_crop_box_are_dropped():
+    depth, label = _plane_depth(ABOVE), _square()
+    depth[60:62, 70:72] = 0.4  # a speck floating above
+    crop = {"crop_lower": [-1, -1, -0.1], "crop_upper": [0.4, 1, 1]}
+    cloud, _, _ = _fuse({"c": (depth, label, ABOVE)}, erosion=0, min_cluster=8)
+    assert np.abs(cloud[:, 2]).max() < 1e-6
+    assert cloud[:, 0].max() > 0.5
+    with_specks, _, _ = _fuse({"c": (depth, label, ABOVE)}, erosion=0, min_cluster=1)
+    assert with_specks[:, 2].max() == pytest.approx(0.4, abs=1e-5)
+    cropped, _, counts = _fuse({"c": (depth, label, ABOVE)}, **crop)
+    assert cropped[:, 0].max() <= 0.4
+    assert counts["c"].valid == 120 * 160
+
+
+def test_two_cameras_see_one_plane_in_one_place():
+    other = RigidTransform(RollPitchYaw(np.pi - 0.5, 0.2, 1.0), [0.3, 0.2, 0.9])
+    cameras = {n: (_plane_depth(X), _square(), X) for n, X in (("a", ABOVE), ("b", other))}
+    both, _, _ = _fuse(cameras, depth_jump=0.1)
+    single = [_fuse({n: c}, depth_jump=0.1)[0] for n, c in cameras.items()]
+    cells = [{tuple(v) for v in np.floor(c[:, :2] / 0.005).astype(int)} for c in single]
+    assert {tuple(v) for v in np.floor(both[:, :2] / 0.005).astype(int)} == cells[0] | cells[1]
+
+
+def test_outputs_follow_the_inputs():
+    fusion = PointCloudFusion({"c": INFO})
+    context = fusion.CreateDefaultContext()
+    fusion.GetInputPort("c.label_image").FixValue(context, _label(_square()))
+    fusion.GetInputPort("c.pose").FixValue(context, ABOVE)
+    sizes = []
+    for factor in (1.0, np.nan, 1.0):
+        depth = _depth(_plane_depth(ABOVE) * np.float32(factor))
+        fusion.GetInputPort("c.depth_image").FixValue(context, depth)
+        sizes.append(fusion.GetOutputPort("target_cloud").Eval(context).size())
+    assert sizes[0] == sizes[2] > sizes[1] == 0
+
+
+def test_bad_settings_and_images_are_refused():
+    with pytest.raises(FusionError, match="camera"):
+        PointCloudFusion({})
+    with pytest.raises(FusionError, match="voxel_size"):
+        PointCloudFusion({"c": INFO}, voxel_size=0.0)
+    with pytest.raises(FusionError, match="crop"):
+        PointCloudFusion({"c": INFO}, crop_lower=[1, 1, 1], crop_upper=[0, 0, 0])
+    small = np.ones((60, 80), dtype=np.float32)
+    with pytest.raises(FusionError, match=r"c\.depth_image: 80 x 60 px.*160 x 120"):
+        _fuse({"c": (small, _square(), ABOVE)})
