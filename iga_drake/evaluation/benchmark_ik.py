@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from pydrake.common.value import Value
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus
 
@@ -92,34 +93,50 @@ class _Watch:
         return EventStatus.Succeeded()
 
 
-def random_reachable_pose(solver: PoseSolver, robot: PlanningRobot, random: np.random.Generator):
-    """A random posture (rad) within limits and free of collisions, and its pose X_WE."""
-    limits = robot.limits
+def random_reachable_pose(
+    solver: PoseSolver, random: np.random.Generator, near: np.ndarray
+) -> tuple[np.ndarray, RigidTransform]:
+    """A random pose X_WE in front of the robot and joint angles (rad) that reach it.
+
+    E lies in a box of 0.4 m x 0.8 m x 0.5 m above the table; it points down, tilted by up to 60
+    degrees to any side, at any angle about its own axis.
+    """
     while True:
-        q = random.uniform(limits.position_lower(), limits.position_upper())
-        if solver.is_valid(q):
-            return q, solver.pose(q)
+        p_WE = random.uniform([0.3, -0.4, 0.02], [0.7, 0.4, 0.52])
+        tilt, side, turn = random.uniform([0, -np.pi, -np.pi], [np.pi / 3, np.pi, np.pi])
+        R_WE = (
+            RotationMatrix.MakeZRotation(side)
+            @ RotationMatrix.MakeYRotation(tilt)
+            @ RotationMatrix.MakeZRotation(turn - side)
+            @ RotationMatrix.MakeXRotation(np.pi)
+        )
+        X_WE = RigidTransform(R_WE, p_WE)
+        q = solver.solve(X_WE, near=near)
+        if q is not None:
+            return q, X_WE
 
 
 def benchmark_ik(count: int = 1000, seed: int = 0, json: bool = False) -> IkBenchmark:
     """Follows `count` random reachable poses one after the other and prints what was seen.
 
-    The poses are those of uniformly random joint angles, so they lie all over the arm's reach. Each
-    is followed from where the arm stands, through the waypoint follower and differential inverse
-    kinematics; the joints that the solver finds for the pose are the nominal posture.
+    Each is followed from where the arm stands, through the waypoint follower and differential
+    inverse kinematics; the joint angles that the solver finds for it are the nominal posture.
     """
     if count < 1:
         raise ValueError(f"count {count}: at least one pose is needed")
     robot = make_panda_planning_robot()
+    # The watch measures distances to the table where it really is.
+    truth = make_panda_planning_robot(safety_distance=0.0, table_distance=0.0)
     solver = PoseSolver(robot)
     builder = DiagramBuilder()
-    follower = builder.AddSystem(WaypointFollower(home=robot.home))
+    follower = builder.AddSystem(WaypointFollower(home=robot.home, solver=solver))
     controller = builder.AddSystem(DifferentialIk(robot))
     kinematics = builder.AddSystem(ForwardKinematics(robot))
     for name in ("desired_pose", "nominal_posture"):
         builder.Connect(follower.GetOutputPort(name), controller.GetInputPort(name))
     position = controller.GetOutputPort("position")
     builder.Connect(position, kinematics.GetInputPort("position"))
+    builder.Connect(position, follower.GetInputPort("position_measured"))
     builder.Connect(kinematics.GetOutputPort("pose"), follower.GetInputPort("pose_measured"))
     builder.ExportInput(follower.GetInputPort("target"), "target")
     diagram = builder.Build()
@@ -127,7 +144,7 @@ def benchmark_ik(count: int = 1000, seed: int = 0, json: bool = False) -> IkBenc
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
     controller.set_initial_position(context, robot.home)
-    watch = _Watch(robot, controller, position, 0.005)
+    watch = _Watch(truth, controller, position, 0.005)
     target_port, status_port = diagram.GetInputPort("target"), follower.GetOutputPort("status")
     target_port.FixValue(context, Value[object](None))
     simulator.set_monitor(watch)
@@ -138,16 +155,14 @@ def benchmark_ik(count: int = 1000, seed: int = 0, json: bool = False) -> IkBenc
     solve_seconds = 0.0
     for sequence in range(1, count + 1):
         solve_start = time.perf_counter()
-        q, X_WE = random_reachable_pose(solver, robot, random)
-        now = position.Eval(controller.GetMyContextFromRoot(context))
-        found = solver.solve(X_WE, near=now)
+        posture, X_WE = random_reachable_pose(solver, random, near=robot.home)
         solve_seconds += time.perf_counter() - solve_start
         target = EndEffectorTarget(
             sequence=sequence,
             X_WE=X_WE,
             opening_moving=0.08,
             opening_reached=0.08,
-            nominal_posture=q if found is None else found,
+            nominal_posture=posture,
         )
         target_port.FixValue(context, Value[object](target))
         end = context.get_time() + _TIME_LIMIT

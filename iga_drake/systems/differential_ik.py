@@ -38,7 +38,7 @@ class DifferentialIkConfig:
     # Distance from which on obstacles count (m).
     collision_influence: float = 0.05
     # Rate at which the null space moves to the nominal posture (1/s).
-    posture_gain: float = 2.0
+    posture_gain: float = 5.0
     # Weight of the pose error against the posture.
     pose_weight: float = 100.0
 

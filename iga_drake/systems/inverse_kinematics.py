@@ -31,7 +31,7 @@ class PoseSolver:
     ) -> None:
         """`starts`: number of starting postures. `position_margin`: distance (rad) that the angles
         keep from the joints' limits; at least that of the controller that follows."""
-        self._robot = robot
+        self.robot = robot
         self._plant = robot.checker.plant()
         limits = robot.limits
         self._lower = limits.position_lower() + position_margin
@@ -46,15 +46,15 @@ class PoseSolver:
 
     def pose(self, q: np.ndarray) -> RigidTransform:
         """X_WE at the joint angles `q`."""
-        return self._robot.pose(q)
+        return self.robot.pose(q)
 
     def is_valid(self, q: np.ndarray) -> bool:
         """Whether `q` keeps the margins to the joints' limits and the safety distance."""
-        distance = self._robot.safety_distance
+        distance = self.robot.safety_distance
         return bool(
             (q >= self._lower - 1e-9).all()
             and (q <= self._upper + 1e-9).all()
-            and self._robot.clearance(q, influence=2 * distance) >= distance
+            and self.robot.clearance(q, influence=2 * distance) >= distance
         )
 
     def solve(self, X_WE: RigidTransform, *, near: np.ndarray | None = None) -> np.ndarray | None:
@@ -68,7 +68,7 @@ class PoseSolver:
         """
         if not np.isfinite(X_WE.GetAsMatrix34()).all():
             raise IgaDrakeError("PoseSolver: the pose X_WE holds values that are not finite")
-        near = self._robot.home if near is None else np.asarray(near, dtype=float)
+        near = self.robot.home if near is None else np.asarray(near, dtype=float)
         starts = sorted(self._starts, key=lambda q: float(np.linalg.norm(q - near)))
         colliding = []
         for start in [near, *starts]:
@@ -91,7 +91,7 @@ class PoseSolver:
     def _solve_from(
         self, X_WE: RigidTransform, start: np.ndarray, near: np.ndarray, *, avoid: bool
     ) -> np.ndarray | None:
-        robot, plant = self._robot, self._plant
+        robot, plant = self.robot, self._plant
         root_context = robot.checker.model().CreateDefaultContext()
         context = plant.GetMyMutableContextFromRoot(root_context)
         ik = InverseKinematics(plant, context, with_joint_limits=False)
@@ -118,7 +118,7 @@ class PoseSolver:
         """Newton steps to the exact pose; None if they don't get there from `q`."""
         if not np.isfinite(q).all():
             return None
-        plant, frame, world = self._plant, self._robot.frame_E, self._plant.world_frame()
+        plant, frame, world = self._plant, self.robot.frame_E, self._plant.world_frame()
         for _ in range(6):
             X_WE_now = self.pose(q)
             turn = (X_WE.rotation() @ X_WE_now.rotation().inverse()).ToAngleAxis()
@@ -130,9 +130,9 @@ class PoseSolver:
                 return q
             if max(rotation_error, position_error) > 0.1:
                 return None
-            context = self._robot.checker.UpdatePositions(self._robot.full(q))
+            context = self.robot.checker.UpdatePositions(self.robot.full(q))
             jacobian = plant.CalcJacobianSpatialVelocity(
                 context, JacobianWrtVariable.kQDot, frame, np.zeros(3), world, world
-            )[:, self._robot.indices]
+            )[:, self.robot.indices]
             q = np.clip(q + np.linalg.pinv(jacobian) @ error, self._lower, self._upper)
         return None

@@ -26,6 +26,10 @@ class PlanningRobot:
     # All positions of the plant, the active ones in a comfortable posture.
     position_default: np.ndarray
 
+    def __deepcopy__(self, memo: dict) -> "PlanningRobot":
+        """Itself: it never changes, and Drake copies the states that hold it."""
+        return self
+
     @property
     def indices(self) -> np.ndarray:
         """Indices of the active joints among the plant's positions."""

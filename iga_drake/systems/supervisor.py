@@ -37,6 +37,10 @@ class _Memory:
     time_overloaded: float | None = None  # since when the torque is too high (s)
     status: SupervisorStatus = field(default_factory=SupervisorStatus)
 
+    def __deepcopy__(self, memo: dict) -> "_Memory":
+        """Itself: it is replaced, never changed, and Drake copies it at every update."""
+        return self
+
 
 class Supervisor(LeafSystem):
     """Passes joint commands on, or holds the arm at the last good one and says why.

@@ -1,16 +1,21 @@
-"""Waypoint follower: from one end-effector target to the next along a straight line."""
+"""Waypoint follower: from one end-effector target to the next at constant speed."""
 
 import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.common.value import AbstractValue, Value
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
 from iga_drake.errors import IgaDrakeError
+from iga_drake.systems.inverse_kinematics import PoseSolver
 from iga_drake.systems.messages import EndEffectorTarget, FollowerStatus
+from iga_drake.systems.paths import LinePath, Path, plan_path, pose_error
+
+# Distance (m) or angle (rad) between desired and measured pose from which on the arm counts as not
+# having got there.
+_LEFT_BEHIND = 0.05
 
 
 @dataclass(frozen=True)
@@ -39,28 +44,19 @@ class _Motion:
     """What the follower remembers from one update to the next."""
 
     target: EndEffectorTarget | None = None
-    X_WStart: RigidTransform | None = None
+    path: Path | None = None
+    duration: float = 0.0  # s, at cruising speed
     X_WDesired: RigidTransform | None = None
+    posture: np.ndarray | None = None  # rad
     progress: float = 0.0  # 0 at the start, 1 at the target
     progress_rate: float = 0.0  # 1/s
     opening: float | None = None  # m
     time_reached: float | None = None  # s
     status: FollowerStatus = field(default_factory=FollowerStatus)
 
-
-def pose_error(X_WA: RigidTransform, X_WB: RigidTransform) -> tuple[float, float]:
-    """Distance (m) and angle (rad) between two poses."""
-    distance = float(np.linalg.norm(X_WA.translation() - X_WB.translation()))
-    rotation = X_WA.rotation().inverse() @ X_WB.rotation()
-    return distance, abs(float(rotation.ToAngleAxis().angle()))
-
-
-def interpolate_pose(X_WA: RigidTransform, X_WB: RigidTransform, share: float) -> RigidTransform:
-    """The pose a `share` of the way from A to B: straight line and shortest rotation."""
-    turn = (X_WA.rotation().inverse() @ X_WB.rotation()).ToAngleAxis()
-    rotation = X_WA.rotation() @ RotationMatrix(AngleAxis(share * turn.angle(), turn.axis()))
-    p_WA, p_WB = X_WA.translation(), X_WB.translation()
-    return RigidTransform(rotation, p_WA + share * (p_WB - p_WA))
+    def __deepcopy__(self, memo: dict) -> "_Motion":
+        """Itself: it is replaced, never changed, and Drake copies it at every update."""
+        return self
 
 
 class WaypointFollower(LeafSystem):
@@ -72,6 +68,7 @@ class WaypointFollower(LeafSystem):
         input_ports:
         - target
         - pose_measured
+        - position_measured (optional)
         output_ports:
         - desired_pose
         - hand.opening
@@ -79,13 +76,16 @@ class WaypointFollower(LeafSystem):
         - status
 
     - `target` (EndEffectorTarget, or None before there is any): a new `sequence` starts a motion
-      from the last commanded pose; linear and angular speed stay within their limits and both
-      motions end together.
+      from the last commanded pose, or from the measured one if the arm didn't get there; linear and
+      angular speed stay within their limits and both motions end together.
     - `pose_measured` (RigidTransform): X_WE.
+    - `position_measured` (N, rad): the arm's joints. If it is connected and a `solver` was given,
+      a straight line that the arm can't follow is replaced by a path through the joints.
     - `desired_pose` (RigidTransform): X_WE now. Before the first target, the pose first measured.
     - `hand.opening` (1, m): `opening_moving` on the way, `opening_reached` after it. Before the
       first target, `initial_opening`.
-    - `nominal_posture` (N, rad): the last posture that a target asked for, at first `home`.
+    - `nominal_posture` (N, rad): the last posture that a target or a path asked for, at first
+      `home`.
     - `status` (FollowerStatus): the last target reached and settled, and the errors of the measured
       pose against the present target. A target out of reach is never reported; whoever sent it has
       to stop waiting.
@@ -98,6 +98,7 @@ class WaypointFollower(LeafSystem):
         *,
         home: np.ndarray,
         initial_opening: float = 0.08,
+        solver: PoseSolver | None = None,
         config: WaypointFollowerConfig | None = None,
     ) -> None:
         super().__init__()
@@ -107,8 +108,9 @@ class WaypointFollower(LeafSystem):
         self._initial_opening = initial_opening
         self._target_input = self.DeclareAbstractInputPort("target", Value[object]())
         self._pose_input = self.DeclareAbstractInputPort("pose_measured", Value(RigidTransform()))
+        self._position_input = self.DeclareVectorInputPort("position_measured", len(self._home))
+        self._solver = solver
         self._motion = self.DeclareAbstractState(Value[object](_Motion()))
-        self._posture = self.DeclareAbstractState(Value[object](self._home))
         self.DeclarePeriodicUnrestrictedUpdateEvent(self._config.time_step, 0.0, self._update)
 
         ticket = {self.abstract_state_ticket(self._motion)}
@@ -119,12 +121,7 @@ class WaypointFollower(LeafSystem):
             ticket | {self._pose_input.ticket()},
         )
         self.DeclareVectorOutputPort("hand.opening", 1, self._calc_opening, ticket)
-        self.DeclareVectorOutputPort(
-            "nominal_posture",
-            len(self._home),
-            self._calc_posture,
-            {self.abstract_state_ticket(self._posture)},
-        )
+        self.DeclareVectorOutputPort("nominal_posture", len(self._home), self._calc_posture, ticket)
         self.DeclareAbstractOutputPort(
             "status", lambda: Value[object](FollowerStatus()), self._calc_status, ticket
         )
@@ -142,24 +139,44 @@ class WaypointFollower(LeafSystem):
         if target is not None and (
             motion.target is None or target.sequence != motion.target.sequence
         ):
-            motion = replace(
-                motion,
-                target=self._check(target),
-                X_WStart=desired,
-                progress=0.0,
-                progress_rate=0.0,
-                time_reached=None,
-            )
-            if target.nominal_posture is not None:
-                state.get_mutable_abstract_state(int(self._posture)).set_value(
-                    np.array(target.nominal_posture, dtype=float)
-                )
+            motion = self._start(context, motion, self._check(target), desired, X_WE)
         if motion.target is None:
             motion = replace(motion, X_WDesired=desired)
         else:
             motion = self._advance(motion, X_WE, context.get_time())
         state.get_mutable_abstract_state(int(self._motion)).set_value(motion)
         return EventStatus.Succeeded()
+
+    def _start(
+        self,
+        context: Context,
+        motion: _Motion,
+        target: EndEffectorTarget,
+        X_WStart: RigidTransform,
+        X_WE: RigidTransform,
+    ) -> _Motion:
+        """Begins the motion to a new target."""
+        if max(pose_error(X_WStart, X_WE)) > _LEFT_BEHIND:
+            X_WStart = X_WE
+        path: Path = LinePath(X_WStart, target.X_WE, target.nominal_posture)
+        if self._solver is not None and self._position_input.HasValue(context):
+            path = plan_path(
+                self._solver,
+                q=self._position_input.Eval(context).copy(),
+                X_WStart=X_WStart,
+                X_WGoal=target.X_WE,
+                nominal=target.nominal_posture,
+            )
+        speeds = self._config.linear_speed, self._config.angular_speed
+        return replace(
+            motion,
+            target=target,
+            path=path,
+            duration=path.duration(*speeds) / target.speed_scale,
+            progress=0.0,
+            progress_rate=0.0,
+            time_reached=None,
+        )
 
     def _check(self, target: EndEffectorTarget) -> EndEffectorTarget:
         """Refuses a target that can't be followed."""
@@ -181,10 +198,7 @@ class WaypointFollower(LeafSystem):
 
     def _advance(self, motion: _Motion, X_WE: RigidTransform, time: float) -> _Motion:
         """One time step of the motion to the present target."""
-        config, target = self._config, motion.target
-        distance, angle = pose_error(motion.X_WStart, target.X_WE)
-        duration = max(distance / config.linear_speed, angle / config.angular_speed)
-        duration /= target.speed_scale
+        config, target, duration = self._config, motion.target, motion.duration
         progress, rate = motion.progress, motion.progress_rate
         if duration > 0 and progress < 1.0:
             # Trapezoid in the share of the way: the rate rises by `acceleration`, and falls again
@@ -212,9 +226,11 @@ class WaypointFollower(LeafSystem):
         finished = motion.status.sequence_reached
         if time_reached is not None and time >= time_reached + target.settle - 1e-9:
             finished = target.sequence
+        posture = motion.path.posture(progress)
         return replace(
             motion,
-            X_WDesired=interpolate_pose(motion.X_WStart, target.X_WE, progress),
+            X_WDesired=motion.path.pose(progress) if progress < 1.0 else target.X_WE,
+            posture=motion.posture if posture is None else posture,
             progress=progress,
             progress_rate=rate,
             opening=target.opening_moving if time_reached is None else target.opening_reached,
@@ -235,7 +251,8 @@ class WaypointFollower(LeafSystem):
         output.SetFromVector([self._initial_opening if opening is None else opening])
 
     def _calc_posture(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_abstract_state(int(self._posture)).get_value())
+        posture = context.get_abstract_state(int(self._motion)).get_value().posture
+        output.SetFromVector(self._home if posture is None else posture)
 
     def _calc_status(self, context: Context, output: AbstractValue) -> None:
         output.set_value(context.get_abstract_state(int(self._motion)).get_value().status)
