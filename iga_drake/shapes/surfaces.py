@@ -403,32 +403,36 @@ def shell_pieces(
     inner: np.ndarray,
     *,
     sectors: int,
+    cuts: Sequence[int] | None = None,
     ratio: float = 1.0,
     arc_points: int = 3,
 ) -> list[np.ndarray]:
-    """Convex pieces of a turned wall: one for each sector and each step of the (r, z) curves.
+    """Convex pieces of a turned wall, sector by sector, each from below to above.
 
-    `outer` and `inner` (K, 2) hold matching points from below to above, at the cuts between the
-    K - 1 rings of pieces. Each piece takes `arc_points` points of the outer arc and the inner
-    chord's ends, so that it covers its part of the wall up to a fraction of a millimetre and sticks
-    into the cavity by the inner chord's sagitta r (1 - cos(pi / sectors)).
+    `outer` and `inner` (K, 2) hold matching (r, z) points from below to above; the wall is cut at
+    the point indices `cuts` (default: at every point) and a piece is the hull of what lies between.
+    It takes `arc_points` points of the outer arc and the ends of the inner chord, so that it covers
+    its part of the wall up to a fraction of a millimetre and sticks into the cavity by the chord's
+    sagitta r (1 - cos(pi / sectors)).
     """
     outer, inner = np.asarray(outer, dtype=np.float64), np.asarray(inner, dtype=np.float64)
+    cuts = range(len(outer)) if cuts is None else cuts
     pieces = []
     width = 2 * np.pi / sectors
     for sector in range(sectors):
         arc = np.linspace(sector * width, (sector + 1) * width, arc_points)
-        for low, high in zip(range(len(outer) - 1), range(1, len(outer)), strict=True):
+        for low, high in pairwise(cuts):
             points = [
-                _turn(curve[level], angles, ratio)
+                turn(curve[level], angles, ratio)
                 for curve, angles in ((outer, arc), (inner, arc[[0, -1]]))
-                for level in (low, high)
+                for level in range(low, high + 1)
             ]
             pieces.append(np.concatenate(points))
     return pieces
 
 
-def _turn(rz: np.ndarray, angles: np.ndarray, ratio: float) -> np.ndarray:
+def turn(rz: np.ndarray, angles: np.ndarray, ratio: float = 1.0) -> np.ndarray:
+    """(n, 3) the point (r, z) turned to `angles` (n,) about z; `ratio` scales y."""
     x, y = rz[0] * np.cos(angles), ratio * rz[0] * np.sin(angles)
     return np.column_stack([x, y, np.full(len(angles), rz[1])])
 

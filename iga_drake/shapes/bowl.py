@@ -1,0 +1,150 @@
+"""Bowls: a turned shell with a foot ring, a curved wall and a rim that may lean outwards."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from iga_drake.shapes import surfaces
+from iga_drake.shapes.instance import ShapeError, ShapeInstance, frame
+
+FAMILY = "bowl"
+PART_NAMES = ("underside", "wall_outside", "rim", "wall_inside", "floor")
+SEGMENTS = 48
+WALL_POINTS = 16
+SECTORS = 14
+# The collision pieces' inner chords lie half inside the wall, half in the cavity: what is free of
+# them is the cavity with its radius times this.
+CAVITY_SHARE = (1 + np.cos(np.pi / SECTORS)) / 2
+# Indices into the WALL_POINTS points at which the wall is cut into rings of convex pieces.
+_LEVELS = (0, 3, 6, 10, 15)
+_CUTS = (0, 2, 4)
+
+# name: (least, greatest); lengths in m, ratios without unit
+RANGES = {
+    "diameter": (0.11, 0.18),  # of the rim, outside
+    "height_ratio": (0.34, 0.52),  # height / diameter
+    "base_ratio": (0.38, 0.56),  # foot's diameter / rim's diameter
+    "bulge": (0.25, 0.85),  # how far the wall starts outwards before it rises
+    "lean": (0.12, 0.6),  # how far the wall still goes outwards at the rim
+    "wall": (0.003, 0.005),
+    "foot_height": (0.002, 0.007),
+    "foot_width": (0.004, 0.008),
+    "mass": (0.10, 0.25),  # kg
+}
+
+
+def sample_parameters(rng: np.random.Generator) -> dict[str, float]:
+    """Draws one bowl; larger bowls are heavier."""
+    parameters = {name: float(rng.uniform(*limits)) for name, limits in RANGES.items()}
+    size = (parameters["diameter"] - 0.11) / 0.07
+    parameters["mass"] = float(np.clip(0.10 + 0.12 * size + rng.uniform(0, 0.03), 0.10, 0.25))
+    return parameters
+
+
+def profile(parameters: dict[str, float]) -> surfaces.ShellProfile:
+    """The (r, z) outline of a bowl (m), z = 0 under the foot ring."""
+    p = _checked(parameters)
+    radius = p["diameter"] / 2
+    height = p["height_ratio"] * p["diameter"]
+    base, foot = p["base_ratio"] * radius, p["foot_height"]
+    reach = radius - base
+    wall = surfaces.bezier(
+        np.array(
+            [
+                [base, foot],
+                [base + p["bulge"] * reach, foot + 0.08 * height],
+                [radius - p["lean"] * reach, foot + 0.5 * (height - foot)],
+                [radius, height],
+            ]
+        ),
+        64,
+    )
+    underside = np.array(
+        [
+            [0.5 * (base - p["foot_width"]), foot],
+            [base - p["foot_width"], foot],
+            [base - 0.8 * p["foot_width"], 0.0],
+            [base - 0.2 * p["foot_width"], 0.0],
+        ]
+    )
+    return surfaces.shell_profile(
+        wall,
+        thickness=p["wall"],
+        base_thickness=1.2 * p["wall"],
+        underside=underside,
+        points=WALL_POINTS,
+    )
+
+
+def build(parameters: dict[str, float]) -> ShapeInstance:
+    """Makes the bowl of these `RANGES` parameters. Raises `ShapeError` for a missing or bad one."""
+    shell = profile(parameters)
+    surface = surfaces.lathe(shell.profile, segments=SEGMENTS)
+    labels = shell.bands[surfaces.lathe_face_bands(len(shell.profile), SEGMENTS)]
+    rim = float(shell.profile[:, 1].max())
+    floor = float(shell.inner[0, 1])
+    instance = ShapeInstance(
+        family=FAMILY,
+        parameters=parameters,
+        vertices=surface.vertices,
+        faces=surface.faces,
+        part_labels=labels,
+        part_names=PART_NAMES,
+        frames={
+            "base": frame((0.0, 0.0, 0.0)),
+            "opening": frame((0.0, 0.0, rim)),
+            "rim": _rim_frame(shell),
+            "floor": frame((0.0, 0.0, floor)),
+        },
+        convex_pieces=_pieces(shell),
+    )
+    return instance.with_mass(parameters["mass"])
+
+
+def _rim_frame(shell: surfaces.ShellProfile) -> np.ndarray:
+    """At the rim's top at azimuth 0: x outwards across the wall, z up along the wall."""
+    middle = (shell.outer + shell.inner) / 2
+    along = middle[-1] - middle[-4]
+    along /= np.linalg.norm(along)
+    top = shell.profile[shell.profile[:, 1].argmax()]
+    return frame(
+        (middle[-1, 0], 0.0, top[1]),
+        x=(along[1], 0.0, -along[0]),
+        z=(along[0], 0.0, along[1]),
+    )
+
+
+def _pieces(shell: surfaces.ShellProfile) -> tuple[np.ndarray, ...]:
+    """Wall sectors in two rings, the lower with the foot, and a floor plate off the table."""
+    outer = shell.outer[list(_LEVELS)].copy()
+    inner = shell.inner[list(_LEVELS)].copy()
+    inner[:, 0] *= CAVITY_SHARE / np.cos(np.pi / SECTORS)
+    inner[-1, 1] = outer[-1, 1] = shell.profile[:, 1].max()
+    foot = shell.profile[4]  # the foot ring's outer lower edge
+    wall = surfaces.shell_pieces(outer, inner, sectors=SECTORS, cuts=_CUTS)
+    lower, upper = wall[0::2], wall[1::2]
+    angle = np.linspace(0, 2 * np.pi, SECTORS + 1)
+    # Each foot sector touches the table with its own edge, so a bowl stands without rocking.
+    foot_edges = [surfaces.turn(foot, np.linspace(start, end, 3)) for start, end in pairwise(angle)]
+    lower = [np.concatenate([piece, edge]) for piece, edge in zip(lower, foot_edges, strict=True)]
+    floor = shell.inner[0, 1]
+    plate_radius = shell.inner[0, 0]
+    thickness = min(0.8 * floor, floor - 0.0005)
+    ring = angle[:-1]
+    plate = np.concatenate(
+        [
+            surfaces.turn(np.array([plate_radius, z]), ring)
+            for z in (floor, max(floor - thickness, 0.0005))
+        ]
+    )
+    return (*lower, *upper, plate)
+
+
+def _checked(parameters: dict[str, float]) -> dict[str, float]:
+    missing = sorted(set(RANGES) - set(parameters))
+    unknown = sorted(set(parameters) - set(RANGES))
+    if missing or unknown:
+        raise ShapeError(
+            f"{FAMILY}: missing parameters {missing}, unknown {unknown}; known: {sorted(RANGES)}"
+        )
+    return parameters

@@ -1,0 +1,142 @@
+"""Pans: a turned shell with sloping walls and one handle that can be grasped from above."""
+
+import numpy as np
+
+from iga_drake.shapes import surfaces
+from iga_drake.shapes.instance import ShapeError, ShapeInstance, frame
+
+FAMILY = "pan"
+PART_NAMES = ("underside", "wall_outside", "rim", "wall_inside", "floor", "handle")
+SEGMENTS = 48
+WALL_POINTS = 12
+SECTORS = 12
+HANDLE_RINGS = 13
+HANDLE_SEGMENTS = 16
+_CAP_RINGS = 3
+# Where the handle is cut into convex pieces (ring indices, caps included).
+_HANDLE_CUTS = (0, 6, 12, HANDLE_RINGS + 2 * _CAP_RINGS - 1)
+
+# name: (least, greatest); lengths in m, angles in rad, ratios without unit
+RANGES = {
+    "diameter": (0.14, 0.24),  # of the rim, outside
+    "height": (0.042, 0.06),
+    "base_ratio": (0.68, 0.97),  # base's diameter / rim's diameter
+    "bulge": (0.2, 0.9),  # 0: straight wall, 1: round edge between base and wall
+    "wall": (0.003, 0.0045),
+    "handle_length": (0.10, 0.16),
+    "handle_width": (0.015, 0.030),
+    "handle_height": (0.012, 0.022),
+    "handle_taper": (0.75, 1.25),  # width at the end / width at the pan
+    "handle_tilt": (0.06, 0.35),  # rise of the handle where it leaves the pan
+    "handle_curve": (-0.25, 0.25),  # change of the tilt along the handle
+    "handle_exponent": (2.2, 6.0),  # of its section: 2 round, 6 nearly a box
+    "mass": (0.25, 0.40),  # kg
+}
+
+
+def sample_parameters(rng: np.random.Generator) -> dict[str, float]:
+    """Draws one pan; larger pans are heavier and have longer handles."""
+    parameters = {name: float(rng.uniform(*limits)) for name, limits in RANGES.items()}
+    size = (parameters["diameter"] - 0.14) / 0.10
+    parameters["mass"] = float(np.clip(0.25 + 0.12 * size + rng.uniform(0, 0.03), 0.25, 0.40))
+    parameters["handle_length"] = float(0.10 + 0.06 * np.clip(size + rng.uniform(-0.4, 0.4), 0, 1))
+    return parameters
+
+
+def profile(parameters: dict[str, float]) -> surfaces.ShellProfile:
+    """The (r, z) outline of the pan's body (m), standing on z = 0."""
+    p = _checked(parameters)
+    radius = p["diameter"] / 2
+    base = p["base_ratio"] * radius
+    edge = [base + 0.8 * (radius - base) * p["bulge"] + 0.002, 0.05 * p["height"] + 0.001]
+    wall = surfaces.bezier(
+        np.array(
+            [
+                [base, 0.0],
+                edge,
+                [0.25 * base + 0.75 * radius, 0.5 * p["height"]],
+                [radius, p["height"]],
+            ]
+        ),
+        64,
+    )
+    return surfaces.shell_profile(
+        wall, thickness=p["wall"], base_thickness=1.2 * p["wall"], points=WALL_POINTS
+    )
+
+
+def _handle_path(p: dict[str, float], shell: surfaces.ShellProfile) -> np.ndarray:
+    """(HANDLE_RINGS, 3) from the middle of the wall outwards along +x."""
+    z = p["height"] - 0.5 * p["handle_height"] - 0.002
+    wall = (shell.outer + shell.inner) / 2
+    start = np.interp(z, wall[:, 1], wall[:, 0])
+    s = np.linspace(0.0, 1.0, HANDLE_RINGS)
+    tilt = p["handle_tilt"] + p["handle_curve"] * s
+    step = p["handle_length"] / (HANDLE_RINGS - 1)
+    middle = (tilt[1:] + tilt[:-1]) / 2
+    x = start + step * np.concatenate([[0.0], np.cumsum(np.cos(middle))])
+    z = z + step * np.concatenate([[0.0], np.cumsum(np.sin(middle))])
+    return np.column_stack([x, np.zeros_like(x), z])
+
+
+def build(parameters: dict[str, float]) -> ShapeInstance:
+    """Makes the pan of these `RANGES` parameters. Raises `ShapeError` for a missing or bad one."""
+    p = _checked(parameters)
+    shell = profile(p)
+    body = surfaces.lathe(shell.profile, segments=SEGMENTS)
+    body_labels = shell.bands[surfaces.lathe_face_bands(len(shell.profile), SEGMENTS)]
+    path = _handle_path(p, shell)
+    taper = np.linspace(1.0, p["handle_taper"], HANDLE_RINGS)
+    # The inner end keeps inside the wall: a flat cap there, a round one at the free end.
+    handle = surfaces.tube(
+        path,
+        width=p["handle_width"] * taper / taper[HANDLE_RINGS // 2],
+        height=p["handle_height"],
+        exponent=p["handle_exponent"],
+        segments=HANDLE_SEGMENTS,
+        caps=(0.2 * p["wall"], 0.35 * p["handle_height"]),
+        cap_rings=_CAP_RINGS,
+    )
+    surface, which = surfaces.join([body, handle])
+    labels = np.where(which == 1, len(PART_NAMES) - 1, 0)
+    labels[: len(body_labels)] = body_labels
+    middle = HANDLE_RINGS // 2
+    return ShapeInstance(
+        family=FAMILY,
+        parameters=p,
+        vertices=surface.vertices,
+        faces=surface.faces,
+        part_labels=labels,
+        part_names=PART_NAMES,
+        frames={
+            "base": frame((0.0, 0.0, 0.0)),
+            "rim": frame((0.0, 0.0, p["height"])),
+            "handle": frame(path[middle], x=path[middle + 1] - path[middle - 1]),
+        },
+        convex_pieces=_pieces(shell, handle),
+    ).with_mass(p["mass"])
+
+
+def _pieces(shell: surfaces.ShellProfile, handle: surfaces.Surface) -> tuple[np.ndarray, ...]:
+    """Wall sectors, a floor plate raised off the table and three lengths of handle."""
+    levels = (0, 5, WALL_POINTS - 1)
+    outer, inner = shell.outer[list(levels)].copy(), shell.inner[list(levels)].copy()
+    inner[-1, 1] = outer[-1, 1] = shell.profile[:, 1].max()
+    # Each wall sector stands on the table with its own edge, so a pan doesn't rock.
+    wall = surfaces.shell_pieces(outer, inner, sectors=SECTORS, cuts=(0, 2))
+    ring = np.arange(SECTORS) * (2 * np.pi / SECTORS)
+    floor = shell.inner[0]
+    radius = max(floor[0], shell.outer[0, 0])
+    plate = np.concatenate([surfaces.turn(np.array([radius, z]), ring) for z in (0.0005, floor[1])])
+    lengths = surfaces.tube_pieces(handle, segments=HANDLE_SEGMENTS, cuts=_HANDLE_CUTS)
+    return (*wall, plate, *lengths)
+
+
+def _checked(parameters: dict[str, float]) -> dict[str, float]:
+    missing = sorted(set(RANGES) - set(parameters))
+    unknown = sorted(set(parameters) - set(RANGES))
+    if missing or unknown:
+        raise ShapeError(
+            f"{FAMILY}: missing parameters {missing}, unknown {unknown}; known: {sorted(RANGES)}"
+        )
+    return parameters

@@ -1,0 +1,263 @@
+"""Stack: put the bowl in the hand into the bowl on the table."""
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from scipy.optimize import linprog
+
+from iga_drake.shapes import bowl
+from iga_drake.shapes.instance import ShapeInstance
+from iga_drake.shapes.sdf import write_sdf
+from iga_drake.station.panda import HOME_POSITION, add_panda
+from iga_drake.station.scene import Scene, SceneObject
+from iga_drake.systems.policy_sequence import TaskMotion
+from iga_drake.tasks.nesting import nesting_height, release_height
+from iga_drake.tasks.task import (
+    ROBOT,
+    Snapshot,
+    Split,
+    Task,
+    TaskError,
+    Verdict,
+    last_seconds,
+    mesh_folder_or_default,
+    tilt,
+)
+
+TARGET, HELD = "target", "grasped"
+SETTLED = 2.0  # s after the release
+TILT = np.radians(20.0)  # between the axes
+OFFSET_SHARE = 0.25  # of the target's diameter, between the axes at the held bowl's base
+DEPTH_SHARE = 0.3  # of the target's height, of the held bowl's base below the target's rim
+REST = 0.003  # m moved in the last half second
+MAXIMUM_DROP = 0.02  # m from the release to nesting, by choice of the pairs
+RELEASE_OPENING = (
+    0.03  # m; more would push the outer finger, which points down, into the bowl below
+)
+_SEEDS: dict[Split, tuple[int, ...]] = {
+    "demonstration": (301, 302, 303, 304, 305, 306),
+    "test": (401, 402, 403, 404, 405, 406, 407, 408),
+}
+_WORK_LOWER, _WORK_UPPER = np.array([0.40, -0.25]), np.array([0.65, 0.25])
+_REACH = (0.42, 0.68)
+_CLEARANCE = 0.0003
+_GRIP_DEPTH = (0.004, 0.007)  # m from the rim to the middle of the pads
+_GRIP_ROLL = 0.1  # rad about the fingers' direction
+_PAD = 0.009  # m, half edge of a pad
+_COLORS = ((0.85, 0.83, 0.76), (0.2, 0.42, 0.6), (0.72, 0.35, 0.24), (0.35, 0.55, 0.4))
+
+
+def grip(shape: ShapeInstance, *, depth: float, roll: float) -> tuple[RigidTransform, float]:
+    """X_OE of a hand that holds a bowl by its rim, and the pads' distance (m) when they touch it.
+
+    The fingers go down along the wall, one inside and one outside; the bowl's axis lies on the
+    hand's +y side. `depth` (m) from the rim to E along the wall, `roll` (rad) about y_E.
+    """
+    azimuth = np.pi / bowl.SECTORS  # the middle of a collision sector
+    R_RE = RotationMatrix(np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]))
+    X_OE = (
+        RigidTransform(RotationMatrix.MakeZRotation(azimuth), [0, 0, 0])
+        @ RigidTransform(shape.frames["rim"])
+        @ RigidTransform(R_RE, [0.0, 0.0, -depth])
+        @ RigidTransform(RotationMatrix.MakeYRotation(roll), [0, 0, 0])
+    )
+    low, high = _extent_between_pads(shape, X_OE)
+    return X_OE @ RigidTransform([0.0, (low + high) / 2, 0.0]), high - low
+
+
+def _extent_between_pads(shape: ShapeInstance, X_OE: RigidTransform) -> tuple[float, float]:
+    """Range of y_E (m) that the collision pieces take up between the pads."""
+    X_EO = X_OE.inverse()
+    values = []
+    for piece in shape.convex_pieces:
+        p = X_EO.multiply(piece.T)  # (3, n)
+        if (p[[0, 2]].min(axis=1) > _PAD).any() or (p[[0, 2]].max(axis=1) < -_PAD).any():
+            continue
+        # Least and greatest y of convex combinations of the corners within the pads' square.
+        between = {
+            "A_ub": np.vstack([p[[0, 2]], -p[[0, 2]]]),
+            "b_ub": np.full(4, _PAD),
+            "A_eq": np.ones((1, p.shape[1])),
+            "b_eq": [1.0],
+        }
+        for sign in (1.0, -1.0):
+            least = linprog(sign * p[1], **between)
+            values += [sign * least.fun] if least.success else []
+    # The opposite wall is far away.
+    values = [value for value in values if abs(value) < 0.02]
+    if not values:
+        raise TaskError("grip: the pads don't reach the bowl's rim")
+    return min(values), max(values)
+
+
+def _pair(seed: int) -> Mapping[str, ShapeInstance]:
+    """Draws bowls until one can be put into the other by a hand that holds its rim."""
+    rng = np.random.default_rng(seed)
+    while True:
+        target = bowl.sample_parameters(rng)
+        held = bowl.sample_parameters(rng)
+        if not 0.8 <= held["diameter"] / target["diameter"] <= 1.03 or target["diameter"] < 0.125:
+            continue
+        if held["lean"] > 0.4:
+            continue  # the hand would lean too far
+        shapes = {TARGET: bowl.build(target), HELD: bowl.build(held)}
+        X_OE, _ = grip(shapes[HELD], depth=_GRIP_DEPTH[1], roll=0.0)
+        profiles = bowl.profile(held), bowl.profile(target)
+        nested = nesting_height(*profiles)
+        release = release_height(*profiles, X_OE, (0.005, RELEASE_OPENING))
+        sunk = 1.0 - nested / bowl.profile(target).profile[:, 1].max()
+        if release - nested <= MAXIMUM_DROP and sunk > DEPTH_SHARE + 0.2:
+            return shapes
+
+
+@cache
+def _instances(split: Split) -> tuple[Mapping[str, ShapeInstance], ...]:
+    return tuple(_pair(seed) for seed in _SEEDS[split])
+
+
+@cache
+def _start_pose() -> RigidTransform:
+    """X_WE at `Stack.observe_posture`."""
+    plant = MultibodyPlant(0.0)
+    panda = add_panda(plant, visuals="none")
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    panda.set_position(context, Stack.observe_posture)
+    return panda.X_WE(context)
+
+
+class Stack(Task):
+    """A bowl stands anywhere in the work area; the hand holds another by its rim, by friction."""
+
+    name = "stack"
+    # The hand turned so that the bowl hangs in front of it, towards the first camera.
+    observe_posture = np.array([*HOME_POSITION[:6], -np.pi / 4])
+    motion = TaskMotion(
+        observes_grasped=True,
+        present=RigidTransform(
+            RotationMatrix(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])),
+            [0.44, 0.0, 0.42],
+        ),
+        before_W=(0.0, 0.0, 0.10),
+        opening_approach=0.0,
+        opening_reached=RELEASE_OPENING,
+        settle=1.0,
+        after_E=(0.0, 0.0, -0.12),
+    )
+
+    def instances(self, split: Split) -> tuple[Mapping[str, ShapeInstance], ...]:
+        return _instances(split)
+
+    def scene(
+        self,
+        seed: int,
+        split: Split = "test",
+        *,
+        instance: int | None = None,
+        mesh_folder: Path | None = None,
+    ) -> Scene:
+        """`Scene.privileged` also holds "X_EO", the held bowl's pose in the hand at the start."""
+        index, shapes, rng = self._choose(seed, split, instance)
+        folder = mesh_folder_or_default(mesh_folder)
+        X_OE, opening = grip(
+            shapes[HELD], depth=rng.uniform(*_GRIP_DEPTH), roll=rng.uniform(-_GRIP_ROLL, _GRIP_ROLL)
+        )
+        X_EO = X_OE.inverse()
+        colors = rng.permutation(len(_COLORS))
+        objects = tuple(
+            SceneObject(
+                name,
+                role,
+                write_sdf(shapes[name], folder, name=name, color=_COLORS[colors[i]], friction=0.7),
+                X_WO,
+            )
+            for i, (name, role, X_WO) in enumerate(
+                ((TARGET, "target", _place(rng)), (HELD, "grasped", _start_pose() @ X_EO))
+            )
+        )
+        return Scene(
+            objects=objects,
+            panda_position=self.observe_posture.copy(),
+            hand_opening=opening + 0.0002,
+            hand_command=0.0,
+            privileged={
+                "task": self.name,
+                "split": split,
+                "instance": index,
+                "shapes": shapes,
+                "X_EO": X_EO,
+            },
+        )
+
+    def expert(
+        self, scene: Scene, X_WO: Mapping[str, RigidTransform], X_WE: RigidTransform
+    ) -> tuple[RigidTransform, ...]:
+        """The held bowl upright above the target on its axis, as low as the hand may go, turned so
+        that the hand is between it and the robot's base."""
+        shapes = scene.privileged["shapes"]
+        X_AE = X_WO[HELD].inverse() @ X_WE
+        profiles = [bowl.profile(shapes[name].parameters) for name in (HELD, TARGET)]
+        height = release_height(*profiles, X_AE, (0.005, RELEASE_OPENING))
+        p_WB = X_WO[TARGET].translation()
+        p_AE = X_AE.translation()
+        yaw = np.arctan2(-p_WB[1], -p_WB[0]) - np.arctan2(p_AE[1], p_AE[0])
+        X_WA = RigidTransform(
+            RotationMatrix.MakeZRotation(yaw), p_WB + np.array([0.0, 0.0, height])
+        )
+        return (X_WA @ X_AE,)
+
+    def success(self, scene: Scene, snapshots: Sequence[Snapshot]) -> Verdict:
+        """At the end, having been free of the robot for the last 2 s:
+
+        - the angle between the bowls' axes is at most 20 deg, the target's tilt at most 10 deg;
+        - the held bowl's base is, in the target's frame, at most 25 % of the target's diameter off
+          its axis and at least 30 % of its height below its rim;
+        - the held bowl touches the target and not the table;
+        - in the last half second it moved by at most 3 mm.
+        """
+        window = last_seconds(self.name, snapshots, SETTLED)
+        target = scene.privileged["shapes"][TARGET]
+        rim = target.frames["opening"][2, 3]
+        diameter = target.parameters["diameter"]
+        last = window[-1]
+        X_TA = last.X_WO[TARGET].inverse() @ last.X_WO[HELD]
+        late = [s for s in window if s.time >= last.time - 0.5]
+        p_late = np.array([s.X_WO[HELD].translation() for s in late])
+        measures = {
+            "tilt": tilt(X_TA),
+            "target_tilt": tilt(last.X_WO[TARGET]),
+            "offset": float(np.hypot(*X_TA.translation()[:2])),
+            "depth": float(rim - X_TA.translation()[2]),
+            "motion": float(np.linalg.norm(p_late - p_late[-1], axis=1).max()),
+        }
+        reason = ""
+        if any(s.touches(HELD, ROBOT) for s in window):
+            reason = f"the hand touched the bowl within the last {SETTLED} s"
+        elif last.touches(HELD, "world"):
+            reason = "the bowl touches the table"
+        elif measures["target_tilt"] > np.radians(10.0):
+            reason = f"the lower bowl is tilted {np.degrees(measures['target_tilt']):.0f} deg"
+        elif not last.touches(HELD, TARGET):
+            reason = "the bowl doesn't rest on the other"
+        elif measures["tilt"] > TILT:
+            reason = f"the bowl's axis is tilted {np.degrees(measures['tilt']):.0f} deg, at most 20"
+        elif measures["offset"] > OFFSET_SHARE * diameter:
+            reason = f"the bowl is {measures['offset']:.3f} m off the other's axis"
+        elif measures["depth"] < DEPTH_SHARE * rim:
+            reason = f"the bowl's base is only {measures['depth']:.3f} m below the other's rim"
+        elif measures["motion"] > REST:
+            reason = f"the bowl still moves ({measures['motion']:.3f} m in 0.5 s)"
+        return Verdict(not reason, reason, measures)
+
+
+def _place(rng: np.random.Generator) -> RigidTransform:
+    """An upright pose on the table within reach, turned anyhow."""
+    while True:
+        x, y = rng.uniform(_WORK_LOWER, _WORK_UPPER)
+        if _REACH[0] <= np.hypot(x, y) <= _REACH[1]:
+            yaw = rng.uniform(-np.pi, np.pi)
+            return RigidTransform(RollPitchYaw(0, 0, yaw), [x, y, _CLEARANCE])
