@@ -12,7 +12,7 @@ def visible_points(
     (`cell` wide at the object's distance, m) is nearer by more than `tolerance` (m).
     """
     rays = points - camera
-    depth = np.linalg.norm(rays, axis=1)
+    depth = np.sqrt(np.einsum("pk,pk->p", rays, rays))
     axis = rays.mean(0)
     distance = np.linalg.norm(axis)
     axis = axis / distance
@@ -30,7 +30,7 @@ def visible_points(
     key = row * width + column
     nearest = np.full(width * (int(row.max()) + 1), np.inf)
     np.minimum.at(nearest, key, depth)
-    facing = (rays * normals).sum(1) < -0.05 * depth
+    facing = np.einsum("pk,pk->p", rays, normals) < -0.05 * depth
     return facing & (depth <= nearest[key] + tolerance)
 
 

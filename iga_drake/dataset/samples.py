@@ -27,7 +27,7 @@ class SampleConfig:
     """How samples are made."""
 
     alignments: int = 5  # N: demonstrations + 1
-    surface_points: int = 3000
+    surface_points: int = 2000
     cloud_points: int = 256  # every observed cloud has this many (sampled with repetition if short)
     voxel: float = 0.005  # m
     neighbourhood: float = 0.2  # fraction of the surface that keeps its pose
@@ -169,7 +169,7 @@ def _observe(
             [np.cos(a) * np.cos(elevation), np.sin(a) * np.cos(elevation), np.sin(elevation)]
         )
         camera = centre + direction * rng.uniform(0.6, 1.0)
-        mask = visible_points(everything, everynormal, camera, cell=0.009, tolerance=0.011)
+        mask = visible_points(everything, everynormal, camera, cell=0.011, tolerance=0.012)
         index = np.flatnonzero(mask[: len(points)])
         cloud = points[index]
         if config.noise and len(index):

@@ -38,6 +38,7 @@ class DescriptorTraining:
     nodes: int = 64
     target_sigma: float = 0.05  # of the canonical size
     visible_within: float = 0.12  # a node counts where a true match is this near
+    bf16: bool = True  # autocast of the matrix products
     seed: int = 0
 
 
@@ -61,7 +62,9 @@ def correspondence_loss(
     nodes = furthest_point_sampling(points, config.nodes, start)
     place = torch.gather(canonical, 1, nodes[..., None].expand(-1, -1, 3))
     M = config.nodes
-    descriptors = net(points, nodes).reshape(2 * S, N * M, -1)
+    with torch.autocast(points.device.type, torch.bfloat16, enabled=config.bf16):
+        descriptors = net(points, nodes)
+    descriptors = descriptors.float().reshape(2 * S, N * M, -1)
     place = place.reshape(2 * S, N * M, 3)
     logits = net.similarity(descriptors, descriptors).reshape(2 * S, N, M, N, M)
     distance = torch.cdist(place, place).reshape(2 * S, N, M, N, M)

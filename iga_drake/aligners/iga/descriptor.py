@@ -150,7 +150,9 @@ class ContextLayer(nn.Module):
         # sum_j g_ij (p_j - p_i), without the (B, h, M, M, 3) products
         weight = attention * gate
         p = relative[:, 0]  # positions up to a common shift
-        pull = weight @ p[:, None] - weight.sum(-1, keepdim=True) * p[:, None]  # (B, h, M, 3)
+        with torch.autocast(p.device.type, enabled=False):
+            weight = weight.to(p.dtype)
+            pull = weight @ p[:, None] - weight.sum(-1, keepdim=True) * p[:, None]  # (B, h, M, 3)
         message = self.vector_out(torch.cat((moved, pull.permute(0, 2, 3, 1)), -1))
         e1, e2, e3 = self.triple(message + v).chunk(3, -1)
         cross = torch.linalg.cross(e1, e2, dim=-2)
@@ -191,7 +193,8 @@ class DescriptorNet(nn.Module):
         cfg = self.config
         x, _, _ = self.normalise(points)
         p = torch.gather(x, 1, nodes[..., None].expand(-1, -1, 3))  # (B, M, 3)
-        s, v = self.local(x, p)
+        with torch.autocast(points.device.type, enabled=False):  # differences of positions
+            s, v = self.local(x, p)
         relative = p[:, None] - p[:, :, None]  # (B, M, M, 3)
         length = relative.square().sum(-1, keepdim=True).add(1e-8).sqrt()
         unit = relative / (length + 0.02)
