@@ -42,6 +42,7 @@ EFFORT_LIMIT = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
 # Implicit position control: stiffness (N m/rad, N/m) and damping of each actuator.
 _ARM_GAINS = PdControllerGains(p=10_000.0, d=100.0)
 _FINGER_GAINS = PdControllerGains(p=20_000.0, d=200.0)
+_DRAKE = "http://drake.mit.edu"  # namespace of Drake's own tags in a URDF
 _GRIPPER_LINKS = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
 
 
@@ -114,9 +115,10 @@ def add_panda(
     """Adds the Panda to `plant` (before Finalize) and welds its base B to the world at `X_WB`.
 
     Args:
-      visuals: what cameras and viewers see. "primitives" are the shapes of the URDF, "meshes" the
-        published meshes (needs the extra `visuals`), "auto" meshes where they can be had, "none"
-        nothing. Collision shapes, and so the physics, are the same in all of them.
+      visuals: what cameras and viewers see. "primitives": both see the URDF's own shapes.
+        "meshes": both see the published meshes (needs the extra `visuals`). "auto": cameras see the
+        primitives, so that perception is the same on every machine, and viewers the meshes where
+        they can be had. "none": nothing. Collision shapes, and so the physics, are always the same.
       X_WB: pose of the robot's base in the world; identity if not given.
       controlled: for a plant that is simulated. Switches the arm's gravity off (the real arm
         compensates its own weight) and gives every actuator an implicit position controller, to be
@@ -188,11 +190,19 @@ def _urdf_text(visuals: Visuals, couple_fingers: bool) -> str:
             )
     for link in root.iter("link"):
         name = link.get("name", "")
-        if visuals == "none" or name in meshes:
-            for visual in link.findall("visual"):
+        for visual in link.findall("visual"):
+            if visuals in ("none", "meshes"):
                 link.remove(visual)
+            elif name in meshes:
+                ElementTree.SubElement(
+                    visual, f"{{{_DRAKE}}}illustration_properties", enabled="false"
+                )
         if name in meshes:
             visual = ElementTree.SubElement(link, "visual", name=f"{name}_mesh")
+            if visuals == "auto":
+                ElementTree.SubElement(
+                    visual, f"{{{_DRAKE}}}perception_properties", enabled="false"
+                )
             if name == "panda_rightfinger":  # the same mesh as the left one, turned about z
                 ElementTree.SubElement(visual, "origin", rpy=f"0 0 {math.pi}")
             geometry = ElementTree.SubElement(visual, "geometry")
@@ -201,7 +211,7 @@ def _urdf_text(visuals: Visuals, couple_fingers: bool) -> str:
         for joint in root.iter("joint"):
             for mimic in joint.findall("mimic"):
                 joint.remove(mimic)
-    ElementTree.register_namespace("drake", "http://drake.mit.edu")
+    ElementTree.register_namespace("drake", _DRAKE)
     return ElementTree.tostring(root, encoding="unicode")
 
 

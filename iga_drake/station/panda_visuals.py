@@ -3,16 +3,59 @@
 They are looked at, and nothing else: no mass, contact or cloud depends on them.
 """
 
+import importlib.util
+import math
+import os
+import sys
+from functools import cache
 from pathlib import Path
 
-_LINKS = (
-    *(f"panda_link{i}" for i in range(8)),
-    "panda_hand",
-    "panda_leftfinger",
-    "panda_rightfinger",
-)
+from iga_drake.paths import cache_dir
+
+# Link -> mesh of the package. The right finger is the left one turned, which the loader does.
+_MESHES = {
+    **{f"panda_link{i}": f"link{i}" for i in range(8)},
+    "panda_hand": "hand",
+    "panda_leftfinger": "finger",
+    "panda_rightfinger": "finger",
+}
+_VERSION = "2"  # of the conversion
 
 
+def _source_dir() -> Path | None:
+    """The folder of the .dae files, None where the package example-robot-data is missing."""
+    relative = "share/example-robot-data/robots/panda_description/meshes/visual"
+    for entry in sys.path:
+        folder = Path(entry) / "cmeel.prefix" / relative
+        if folder.is_dir():
+            return folder
+    return None
+
+
+@cache
 def mesh_visuals() -> dict[str, Path]:
     """Link name -> mesh file that Drake can draw; empty where the packages are missing."""
-    return {}
+    source = _source_dir()
+    if source is None or importlib.util.find_spec("collada") is None:
+        return {}
+    target = cache_dir() / f"panda_visuals_v{_VERSION}"
+    target.mkdir(parents=True, exist_ok=True)
+    for name in set(_MESHES.values()):
+        if not (target / f"{name}.gltf").exists():
+            _convert(source / f"{name}.dae", target / f"{name}.gltf")
+    return {link: target / f"{name}.gltf" for link, name in _MESHES.items()}
+
+
+def _convert(source: Path, target: Path) -> None:
+    """Writes one .dae file as a glTF with everything embedded, y up as glTF wants it."""
+    import trimesh
+
+    scene = trimesh.load_scene(source)
+    for geometry in scene.geometry.values():
+        material = geometry.visual.material
+        material.metallicFactor, material.roughnessFactor = 0.0, 0.6
+    scene.apply_transform(trimesh.transformations.rotation_matrix(-math.pi / 2, [1, 0, 0]))
+    files = trimesh.exchange.gltf.export_gltf(scene, embed_buffers=True)
+    part = target.with_suffix(f".{os.getpid()}.part")
+    part.write_bytes(files["model.gltf"])
+    part.replace(target)
