@@ -220,7 +220,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     return SUCCESS
 
 
-# benchmark and train: modules with `add_arguments(parser)` and `main(arguments) -> int`
+# benchmark and train: modules with `main(argv) -> int`, or `add_arguments(parser)` and
+# `main(arguments) -> int`
 
 DELEGATES = ("benchmark", "train")
 BENCHMARKS = ("fusion", "inference", "ik")
@@ -254,6 +255,8 @@ def _train(arguments: argparse.Namespace) -> int:
 
 
 def _run_delegate(module: Any, prog: str, options: Sequence[str]) -> int:
+    if not hasattr(module, "add_arguments"):
+        return int(module.main(list(options)) or SUCCESS)
     parser = argparse.ArgumentParser(prog=prog, description=module.__doc__)
     module.add_arguments(parser)
     return int(module.main(parser.parse_args(options)) or SUCCESS)

@@ -78,6 +78,7 @@ def build_episode_diagram(
     robot = make_panda_planning_robot()
     control = scenario.control
     kinematics = builder.AddNamedSystem("forward_kinematics", ForwardKinematics(robot))
+    solver = PoseSolver(robot)
     opening = scene.hand_opening if scene.hand_command is None else scene.hand_command
     follower = builder.AddNamedSystem(
         "follower",
@@ -89,6 +90,7 @@ def build_episode_diagram(
                 linear_speed=control.linear_speed,
                 angular_speed=control.angular_speed,
             ),
+            solver=solver,
         ),
     )
     ik = builder.AddNamedSystem(
@@ -103,7 +105,6 @@ def build_episode_diagram(
     supervisor = builder.AddNamedSystem(
         "supervisor", Supervisor(robot, SupervisorConfig(time_step=control.period))
     )
-    solver = PoseSolver(robot)
     limits = scenario.time_limits
     policy = builder.AddNamedSystem(
         "policy",
@@ -138,6 +139,7 @@ def build_episode_diagram(
     connect(supervisor, "status", policy, "supervisor.status")
     connect(policy, "target", follower, "target")
     connect(kinematics, "pose", follower, "pose_measured")
+    connect(station, "panda.position_measured", follower, "position_measured")
     connect(follower, "desired_pose", ik, "desired_pose")
     connect(follower, "nominal_posture", ik, "nominal_posture")
     connect(ik, "position", supervisor, "position_commanded")
