@@ -187,7 +187,7 @@ def _open3d(scenario: Scenario, images: Images) -> Callable[[], int] | None:
         intrinsic = open3d.camera.PinholeCameraIntrinsic(k.width, k.height, k.fx, k.fy, k.cx, k.cy)
         # Open3D takes 0 for "nothing there".
         finite = np.where(np.isfinite(depth[:, :, 0]), depth[:, :, 0], np.float32(0.0))
-        image = open3d.geometry.Image(np.ascontiguousarray(finite))
+        image = open3d.geometry.Image(np.ascontiguousarray(finite))  # type: ignore[call-overload]
         inputs.append((image, intrinsic, X_WC.inverse().GetAsMatrix4()))
 
     def run() -> int:

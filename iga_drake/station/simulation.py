@@ -1,5 +1,7 @@
 """The simulation station: robot, table, objects and cameras behind the one port contract."""
 
+from typing import cast
+
 import numpy as np
 from pydrake.geometry import Box, Meshcat, SceneGraph
 from pydrake.math import RigidTransform
@@ -19,7 +21,7 @@ from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
 from iga_drake.errors import IgaDrakeError
 from iga_drake.station.cameras import add_camera, add_renderer
 from iga_drake.station.meshcat import add_visualizers
-from iga_drake.station.panda import PandaModel, add_panda
+from iga_drake.station.panda import PandaModel, Visuals, add_panda
 from iga_drake.station.panda_command import PandaCommand
 from iga_drake.station.ports import HAND_OPENING_MAX, PANDA_JOINTS, Role, station_ports
 from iga_drake.station.scenario import Scenario, Table
@@ -55,7 +57,7 @@ def build_simulation_station(
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(config=scenario.plant, builder=builder)
     plant.set_name("plant")
-    panda = add_panda(plant, controlled=True, visuals=scenario.panda.visuals)
+    panda = add_panda(plant, controlled=True, visuals=cast(Visuals, scenario.panda.visuals))
     _add_table(plant, scenario.table)
     roles = {int(body): Role.ROBOT for body in plant.GetBodyIndices(panda.instance)}
     for item in scene.objects:

@@ -148,11 +148,11 @@ class PointCloudFusion(LeafSystem):
                 clouds.append(points if mine.all() else points.compress(mine, axis=1))
                 number[role] = clouds[-1].shape[1]
             counts[name] = CameraCounts(valid, number[self._target], number[self._grasped])
-        clouds = [
+        target, grasped = (
             voxel_cloud(np.hstack(parts[role]).T, self._voxel_size, self._min_cluster)
             for role in (self._target, self._grasped)
-        ]
-        value.set_value(FusedClouds(*clouds, counts))
+        )
+        value.set_value(FusedClouds(target, grasped, counts))
 
     def _unproject(
         self, name: str, depth: np.ndarray, label: np.ndarray, X_WC: RigidTransform
