@@ -55,6 +55,7 @@ def show_prediction(
     path: str = "perception",
 ) -> None:
     """Shows the target cloud and, where a pose was predicted, the grasped cloud carried there."""
+    meshcat.SetCameraPose(np.array([1.5, -0.9, 0.8]), np.array([0.35, 0.0, 0.2]))
     show_cloud(meshcat, f"{path}/target cloud", target, TARGET_COLOR)
     if X_WE is not None:
         show_triad(meshcat, f"{path}/predicted pose", X_WE)

@@ -48,8 +48,9 @@ class Table:
 class Panda:
     """The robot in simulation."""
 
-    # What cameras and viewers see: "primitives" (simple shapes), "meshes" (the published meshes,
-    # needs the extra `visuals`), or "auto" (meshes where they can be had). Collisions are the same.
+    # What is drawn: "primitives" (simple shapes), "meshes" (the published meshes, needs the extra
+    # `visuals`), or "auto": primitives for the cameras, so that perception is the same on every
+    # machine, and meshes for viewers where they can be had. Collisions are the same in all.
     visuals: str = "auto"
 
 
@@ -225,12 +226,15 @@ class Control:
 
 @dataclass
 class PhaseTimeLimits:
-    """Simulated time after which a phase of the policy has failed (s), each > 0."""
+    """Time after which a phase of the policy has failed (s), each > 0.
+
+    Simulated time, but for `infer`: that is wall-clock time.
+    """
 
     observe_target: float = 20.0
     present: float = 20.0
     observe_grasped: float = 10.0
-    infer: float = 10.0
+    infer: float = 60.0
     execute: float = 60.0
 
 
