@@ -98,7 +98,9 @@ class Supervisor(LeafSystem):
 
     def _first_position(self, context: Context) -> np.ndarray:
         command = self._commanded_input.Eval(context)
-        return command if np.isfinite(command).all() else self._position_input.Eval(context)
+        if not np.isfinite(command).all():
+            command = self._position_input.Eval(context)
+        return np.array(command)
 
     def _update(self, context: Context, state: State) -> EventStatus:
         memory: _Memory = context.get_abstract_state(int(self._memory)).get_value()

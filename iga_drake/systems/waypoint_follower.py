@@ -133,7 +133,7 @@ class WaypointFollower(LeafSystem):
 
     def _update(self, context: Context, state: State) -> EventStatus:
         motion: _Motion = context.get_abstract_state(int(self._motion)).get_value()
-        X_WE = self._pose_input.Eval(context)
+        X_WE = RigidTransform(self._pose_input.Eval(context))  # a copy: Eval refers to the cache
         target = self._target_input.Eval(context)
         desired = motion.X_WDesired or X_WE
         if target is not None and (
@@ -198,7 +198,9 @@ class WaypointFollower(LeafSystem):
 
     def _advance(self, motion: _Motion, X_WE: RigidTransform, time: float) -> _Motion:
         """One time step of the motion to the present target."""
-        config, target, duration = self._config, motion.target, motion.duration
+        config, target, path = self._config, motion.target, motion.path
+        assert target is not None and path is not None
+        duration = motion.duration
         progress, rate = motion.progress, motion.progress_rate
         if duration > 0 and progress < 1.0:
             # Trapezoid in the share of the way: the rate rises by `acceleration`, and falls again
@@ -226,10 +228,10 @@ class WaypointFollower(LeafSystem):
         finished = motion.status.sequence_reached
         if time_reached is not None and time >= time_reached + target.settle - 1e-9:
             finished = target.sequence
-        posture = motion.path.posture(progress)
+        posture = path.posture(progress)
         return replace(
             motion,
-            X_WDesired=motion.path.pose(progress) if progress < 1.0 else target.X_WE,
+            X_WDesired=path.pose(progress) if progress < 1.0 else target.X_WE,
             posture=motion.posture if posture is None else posture,
             progress=progress,
             progress_rate=rate,
