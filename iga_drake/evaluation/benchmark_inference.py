@@ -1,0 +1,59 @@
+"""`iga benchmark inference`: time to infer one waypoint, learned aligner beside ICP in the same run."""
+
+import argparse
+import json
+import time
+
+import numpy as np
+import torch
+
+from iga_drake.aligners.protocol import Aligner, Alignment
+from iga_drake.aligners.registry import make_aligner
+from iga_drake.dataset.samples import make_sample
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the benchmark."""
+    parser.add_argument("--count", type=int, default=10, help="waypoints inferred (default 10)")
+    parser.add_argument("--demonstrations", type=int, default=4, choices=range(1, 5))
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--json", action="store_true")
+
+
+def _times(aligner: Aligner, count: int, demonstrations: int) -> np.ndarray:
+    seconds = []
+    for index in range(count + 1):  # the first warms up
+        sample = make_sample("validation", index)
+        context = tuple(
+            Alignment(sample.points[0, n], sample.points[1, n]) for n in range(demonstrations)
+        )
+        began = time.perf_counter()
+        aligner.align(context, sample.points[0, -1], sample.points[1, -1], seed=index)
+        seconds.append(time.perf_counter() - began)
+    return np.array(seconds[1:])
+
+
+def main(arguments: argparse.Namespace) -> int:
+    """Prints median, minimum and maximum of both aligners and the ratio of the medians."""
+    torch.set_num_threads(arguments.threads)
+    result: dict[str, dict[str, float]] = {}
+    for name in ("iga", "icp"):
+        seconds = _times(make_aligner(name), arguments.count, arguments.demonstrations)
+        result[name] = {
+            "median_s": float(np.median(seconds)),
+            "min_s": float(seconds.min()),
+            "max_s": float(seconds.max()),
+        }
+    ratio = result["iga"]["median_s"] / result["icp"]["median_s"]
+    if arguments.json:
+        settings = {k: getattr(arguments, k) for k in ("count", "demonstrations", "threads")}
+        print(json.dumps({**settings, **result, "ratio_iga_to_icp": ratio}))
+        return 0
+    print(
+        f"one waypoint, {arguments.demonstrations} demonstrations, {arguments.count} problems, "
+        f"{arguments.threads} threads"
+    )
+    for name, row in result.items():
+        print(f"  {name:<4} {row['median_s']:.3f} s median ({row['min_s']:.3f} to {row['max_s']:.3f})")
+    print(f"  iga / icp: {ratio:.2f}")
+    return 0
