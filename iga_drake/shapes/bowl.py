@@ -15,9 +15,8 @@ SECTORS = 14
 # The collision pieces' inner chords lie half inside the wall, half in the cavity: what is free of
 # them is the cavity with its radius times this.
 CAVITY_SHARE = (1 + np.cos(np.pi / SECTORS)) / 2
-# Indices into the WALL_POINTS points at which the wall is cut into rings of convex pieces.
-_LEVELS = (0, 3, 6, 10, 15)
-_CUTS = (0, 2, 4)
+# Indices of the WALL_POINTS points that pieces take.
+_LEVELS = (0, 3, 6, 9, 12, 15)
 
 # name: (least, greatest); lengths in m, ratios without unit
 RANGES = {
@@ -114,30 +113,52 @@ def _rim_frame(shell: surfaces.ShellProfile) -> np.ndarray:
     )
 
 
+def cavity(shell: surfaces.ShellProfile) -> np.ndarray:
+    """(WALL_POINTS, 2) (r, z) of the cavity that the collision pieces leave free, from the floor's
+    edge to the rim: a little less than inside `shell.inner`."""
+    cut = _cut_levels(shell)
+    free = np.interp(shell.inner[:, 1], shell.inner[cut, 1], shell.inner[cut, 0])
+    radius = np.minimum(free, shell.inner[:, 0]) * CAVITY_SHARE
+    return np.column_stack([radius, shell.inner[:, 1]])
+
+
+def _cut_levels(shell: surfaces.ShellProfile) -> list[int]:
+    """Wall points at which the wall is cut into two rings, so that chords stay near the wall."""
+    last = WALL_POINTS - 1
+    middle = min(
+        _LEVELS[1:-1], key=lambda k: max(_sagitta(shell.inner[: k + 1]), _sagitta(shell.inner[k:]))
+    )
+    return [0, middle, last]
+
+
 def _pieces(shell: surfaces.ShellProfile) -> tuple[np.ndarray, ...]:
     """Wall sectors in two rings, the lower with the foot, and a floor plate off the table."""
-    outer = shell.outer[list(_LEVELS)].copy()
-    inner = shell.inner[list(_LEVELS)].copy()
+    rim = shell.profile[4 + 1 + WALL_POINTS :][:3]  # outside, top, inside
+    outer = np.vstack([shell.outer[list(_LEVELS)], rim[:2]])
+    inner = np.vstack([shell.inner[list(_LEVELS)], rim[:0:-1]])
     inner[:, 0] *= CAVITY_SHARE / np.cos(np.pi / SECTORS)
-    inner[-1, 1] = outer[-1, 1] = shell.profile[:, 1].max()
-    foot = shell.profile[4]  # the foot ring's outer lower edge
-    wall = surfaces.shell_pieces(outer, inner, sectors=SECTORS, cuts=_CUTS)
-    lower, upper = wall[0::2], wall[1::2]
-    angle = np.linspace(0, 2 * np.pi, SECTORS + 1)
+    cut = _LEVELS.index(_cut_levels(shell)[1])
+    wall = surfaces.shell_pieces(outer, inner, sectors=SECTORS, cuts=(0, cut, len(outer) - 1))
     # Each foot sector touches the table with its own edge, so a bowl stands without rocking.
-    foot_edges = [surfaces.turn(foot, np.linspace(start, end, 3)) for start, end in pairwise(angle)]
-    lower = [np.concatenate([piece, edge]) for piece, edge in zip(lower, foot_edges, strict=True)]
-    floor = shell.inner[0, 1]
-    plate_radius = shell.inner[0, 0]
-    thickness = min(0.8 * floor, floor - 0.0005)
-    ring = angle[:-1]
-    plate = np.concatenate(
-        [
-            surfaces.turn(np.array([plate_radius, z]), ring)
-            for z in (floor, max(floor - thickness, 0.0005))
-        ]
-    )
-    return (*lower, *upper, plate)
+    foot = [
+        np.concatenate(
+            [surfaces.turn(edge, np.linspace(start, end, 3)) for edge in shell.profile[3:5]]
+        )
+        for start, end in pairwise(np.linspace(0, 2 * np.pi, SECTORS + 1))
+    ]
+    lower = [np.concatenate(both) for both in zip(wall[0::2], foot, strict=True)]
+    floor = shell.inner[0]
+    low = max(shell.profile[0, 1], 0.0005)
+    ring = np.arange(2 * SECTORS) * (np.pi / SECTORS)
+    plate = [surfaces.turn(np.array([floor[0], z]), ring) for z in (low, floor[1])]
+    return (*lower, *wall[1::2], np.concatenate(plate))
+
+
+def _sagitta(curve: np.ndarray) -> float:
+    """Greatest distance (m) of a curve's points (n, 2) from its chord."""
+    chord = curve[-1] - curve[0]
+    arm = curve - curve[0]
+    return float(np.abs(arm[:, 0] * chord[1] - arm[:, 1] * chord[0]).max() / np.linalg.norm(chord))
 
 
 def _checked(parameters: dict[str, float]) -> dict[str, float]:

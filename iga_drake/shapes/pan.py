@@ -13,33 +13,44 @@ SECTORS = 12
 HANDLE_RINGS = 13
 HANDLE_SEGMENTS = 16
 _CAP_RINGS = 3
-# Where the handle is cut into convex pieces (ring indices, caps included).
-_HANDLE_CUTS = (0, 6, 12, HANDLE_RINGS + 2 * _CAP_RINGS - 1)
+# Where along the handle a hand takes it, from 0 at the pan to 1 at the end.
+GRASP_AT = 0.42
+HOLDABLE = 0.28  # N m, what two pads hold by friction when the pan hangs from them
+# Where the handle is cut into convex pieces (ring indices, caps included): from the wall to before
+# the pads, between the pads, to the end.
+_HANDLE_CUTS = (_CAP_RINGS, 6, 11)
+_HANDLE_END = HANDLE_RINGS + 2 * _CAP_RINGS - 1
 
 # name: (least, greatest); lengths in m, angles in rad, ratios without unit
 RANGES = {
-    "diameter": (0.14, 0.24),  # of the rim, outside
+    "diameter": (0.14, 0.22),  # of the rim, outside
     "height": (0.042, 0.06),
     "base_ratio": (0.68, 0.97),  # base's diameter / rim's diameter
     "bulge": (0.2, 0.9),  # 0: straight wall, 1: round edge between base and wall
     "wall": (0.003, 0.0045),
     "handle_length": (0.10, 0.16),
     "handle_width": (0.015, 0.030),
-    "handle_height": (0.012, 0.022),
+    "handle_height": (0.014, 0.024),
     "handle_taper": (0.75, 1.25),  # width at the end / width at the pan
     "handle_tilt": (0.06, 0.35),  # rise of the handle where it leaves the pan
     "handle_curve": (-0.25, 0.25),  # change of the tilt along the handle
-    "handle_exponent": (2.2, 6.0),  # of its section: 2 round, 6 nearly a box
-    "mass": (0.25, 0.40),  # kg
+    "handle_exponent": (2.8, 7.0),  # of its section: 2 round, 7 nearly a box
+    "mass": (0.18, 0.40),  # kg
 }
 
 
 def sample_parameters(rng: np.random.Generator) -> dict[str, float]:
-    """Draws one pan; larger pans are heavier and have longer handles."""
+    """Draws one pan; larger pans are heavier and have longer handles.
+
+    The mass is bounded so that the weight turns a hand at the handle by at most `HOLDABLE`.
+    """
     parameters = {name: float(rng.uniform(*limits)) for name, limits in RANGES.items()}
-    size = (parameters["diameter"] - 0.14) / 0.10
-    parameters["mass"] = float(np.clip(0.25 + 0.12 * size + rng.uniform(0, 0.03), 0.25, 0.40))
+    size = (parameters["diameter"] - 0.14) / 0.08
     parameters["handle_length"] = float(0.10 + 0.06 * np.clip(size + rng.uniform(-0.4, 0.4), 0, 1))
+    instance = build(parameters)
+    arm = instance.frames["handle"][0, 3] - instance.mass_properties.p_OCcm[0]
+    mass = min(0.24 + 0.11 * size + rng.uniform(0, 0.03), HOLDABLE / (9.81 * arm))
+    parameters["mass"] = float(np.clip(mass, *RANGES["mass"]))
     return parameters
 
 
@@ -100,7 +111,7 @@ def build(parameters: dict[str, float]) -> ShapeInstance:
     surface, which = surfaces.join([body, handle])
     labels = np.where(which == 1, len(PART_NAMES) - 1, 0)
     labels[: len(body_labels)] = body_labels
-    middle = HANDLE_RINGS // 2
+    grasp = round(GRASP_AT * (HANDLE_RINGS - 1))
     return ShapeInstance(
         family=FAMILY,
         parameters=p,
@@ -111,7 +122,7 @@ def build(parameters: dict[str, float]) -> ShapeInstance:
         frames={
             "base": frame((0.0, 0.0, 0.0)),
             "rim": frame((0.0, 0.0, p["height"])),
-            "handle": frame(path[middle], x=path[middle + 1] - path[middle - 1]),
+            "handle": frame(path[grasp], x=path[grasp + 1] - path[grasp - 1]),
         },
         convex_pieces=_pieces(shell, handle),
     ).with_mass(p["mass"])
@@ -119,16 +130,22 @@ def build(parameters: dict[str, float]) -> ShapeInstance:
 
 def _pieces(shell: surfaces.ShellProfile, handle: surfaces.Surface) -> tuple[np.ndarray, ...]:
     """Wall sectors, a floor plate raised off the table and three lengths of handle."""
-    levels = (0, 5, WALL_POINTS - 1)
+    levels = (0, 1, 2, 3, 5, 8, WALL_POINTS - 1)
     outer, inner = shell.outer[list(levels)].copy(), shell.inner[list(levels)].copy()
     inner[-1, 1] = outer[-1, 1] = shell.profile[:, 1].max()
     # Each wall sector stands on the table with its own edge, so a pan doesn't rock.
-    wall = surfaces.shell_pieces(outer, inner, sectors=SECTORS, cuts=(0, 2))
-    ring = np.arange(SECTORS) * (2 * np.pi / SECTORS)
+    wall = surfaces.shell_pieces(outer, inner, sectors=SECTORS, cuts=(0, len(levels) - 1))
+    ring = np.arange(2 * SECTORS) * (np.pi / SECTORS)
     floor = shell.inner[0]
     radius = max(floor[0], shell.outer[0, 0])
     plate = np.concatenate([surfaces.turn(np.array([radius, z]), ring) for z in (0.0005, floor[1])])
-    lengths = surfaces.tube_pieces(handle, segments=HANDLE_SEGMENTS, cuts=_HANDLE_CUTS)
+    # Few facets where the pads touch make contact surfaces quick: ends of the lengths only.
+    lengths = surfaces.tube_pieces(
+        handle, segments=HANDLE_SEGMENTS, cuts=_HANDLE_CUTS, ends_only=True
+    )
+    lengths += surfaces.tube_pieces(
+        handle, segments=HANDLE_SEGMENTS, cuts=(_HANDLE_CUTS[-1], _HANDLE_END)
+    )
     return (*wall, plate, *lengths)
 
 

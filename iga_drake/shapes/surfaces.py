@@ -437,12 +437,18 @@ def turn(rz: np.ndarray, angles: np.ndarray, ratio: float = 1.0) -> np.ndarray:
     return np.column_stack([x, y, np.full(len(angles), rz[1])])
 
 
-def tube_pieces(surface: Surface, *, segments: int, cuts: Sequence[int]) -> list[np.ndarray]:
-    """Convex pieces of a loft with `segments` points a ring: hulls between ring indices `cuts`."""
+def tube_pieces(
+    surface: Surface, *, segments: int, cuts: Sequence[int], ends_only: bool = False
+) -> list[np.ndarray]:
+    """Convex pieces of a loft with `segments` points a ring: hulls between ring indices `cuts`.
+
+    With `ends_only` a piece takes the rings at its ends alone, for fewer facets.
+    """
     rings = surface.vertices[1:-1].reshape(-1, segments, 3)
     pieces = []
     for low, high in pairwise(cuts):
-        parts = [rings[low : high + 1].reshape(-1, 3)]
+        taken = [low, high] if ends_only else range(low, high + 1)
+        parts = [rings[taken].reshape(-1, 3)]
         parts += [surface.vertices[:1]] if low == 0 else []
         parts += [surface.vertices[-1:]] if high == len(rings) - 1 else []
         pieces.append(np.concatenate(parts))

@@ -85,6 +85,7 @@ class Grasp(Task):
             mesh_folder_or_default(mesh_folder),
             name=TARGET,
             color=_COLORS[rng.integers(len(_COLORS))],
+            friction=1.0,
         )
         return Scene(
             objects=(SceneObject(TARGET, "target", sdf, _place(shape, rng)),),

@@ -7,13 +7,12 @@ from iga_drake.shapes import bowl
 from iga_drake.shapes.surfaces import ShellProfile
 from iga_drake.station.panda import gripper_cloud
 
-# The collision pieces' inner chords stand into the cavity; see `bowl.CAVITY_SHARE`.
 _GAP = 0.003  # m kept between the hand and the other bowl
 
 
 def _top(shell: ShellProfile, r: np.ndarray) -> np.ndarray:
     """Height (m) of the upper side of a bowl at radii r (m); -inf beyond its rim."""
-    inner = shell.inner * [bowl.CAVITY_SHARE, 1.0]
+    inner = bowl.cavity(shell)
     radius = np.concatenate([[0.0], inner[:, 0], [shell.outer[-1, 0]]])
     height = np.concatenate([[inner[0, 1]], inner[:, 1], [shell.profile[:, 1].max()]])
     return np.where(r <= radius[-1], np.interp(r, np.maximum.accumulate(radius), height), -np.inf)
@@ -48,12 +47,13 @@ def release_height(
     p_AG = X_AE.multiply(points[points[:, 2] > -0.06].T).T
     r = np.hypot(p_AG[:, 0], p_AG[:, 1])
     rim = target.profile[:, 1].max()
+    cavity = bowl.cavity(target)
     base = nesting_height(held, target) + drop
     for height in base + np.arange(0.0, 0.06, 0.001):
         z = p_AG[:, 2] + height
         outer = np.interp(z, target.outer[:, 1], target.outer[:, 0]) + _GAP
-        inner = np.interp(z, target.inner[:, 1], target.inner[:, 0]) - _GAP
-        inner = np.where(z < target.inner[0, 1] + _GAP, 0.0, inner)
+        inner = np.interp(z, cavity[:, 1], cavity[:, 0]) - _GAP
+        inner = np.where(z < cavity[0, 1] + _GAP, 0.0, inner)
         if not ((r > inner) & (r < outer) & (z < rim + _GAP)).any():
             return float(height)
     return float(base + 0.06)
