@@ -42,8 +42,8 @@ _SEEDS: dict[Split, tuple[int, ...]] = {
     "demonstration": (301, 302, 303, 304, 305, 306),
     "test": (401, 402, 403, 404, 405, 406, 407, 408),
 }
-_WORK_LOWER, _WORK_UPPER = np.array([0.40, -0.25]), np.array([0.65, 0.25])
-_REACH = (0.42, 0.68)
+_WORK_LOWER, _WORK_UPPER = np.array([0.42, -0.25]), np.array([0.65, 0.25])
+_REACH = (0.48, 0.68)
 _CLEARANCE = 0.0003
 _GRIP_DEPTH = (0.004, 0.007)  # m from the rim to the middle of the pads
 _GRIP_ROLL = 0.1  # rad about the fingers' direction

@@ -1,0 +1,70 @@
+"""Scenes in a plant, for tests: what touches what, and where things come to rest."""
+
+from pydrake.geometry import Box
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    CoulombFriction,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from iga_drake.station.panda import PandaModel, add_panda
+from iga_drake.station.panda_command import PandaCommand
+from iga_drake.station.scene import Scene
+
+
+class Rest:
+    """The scene's objects on the table with the Panda holding its first posture."""
+
+    def __init__(self, scene: Scene) -> None:
+        builder = DiagramBuilder()
+        config = MultibodyPlantConfig(
+            time_step=0.002,
+            contact_model="hydroelastic_with_fallback",
+            discrete_contact_approximation="sap",
+        )
+        self.plant: MultibodyPlant
+        self.plant, self.scene_graph = AddMultibodyPlant(config=config, builder=builder)
+        self.panda: PandaModel = add_panda(self.plant, visuals="none", controlled=True)
+        self.plant.RegisterCollisionGeometry(
+            self.plant.world_body(),
+            RigidTransform([0.35, 0.0, -0.025]),
+            Box(1.5, 1.6, 0.05),
+            "table",
+            CoulombFriction(0.6, 0.6),
+        )
+        for item in scene.objects:
+            (instance,) = Parser(self.plant).AddModelsFromString(item.sdf, "sdf")
+            body = self.plant.GetBodyByName(item.name, instance)
+            self.plant.SetDefaultFloatingBaseBodyPose(body, item.X_WO)
+        self.plant.Finalize()
+        command = builder.AddSystem(PandaCommand(time_step=0.002))
+        opening = scene.hand_opening if scene.hand_command is None else scene.hand_command
+        for port, value in (("panda.position", scene.panda_position), ("hand.opening", [opening])):
+            source = builder.AddSystem(ConstantVectorSource(value))
+            builder.Connect(source.get_output_port(), command.GetInputPort(port))
+        builder.Connect(
+            command.GetOutputPort("desired_state"),
+            self.plant.get_desired_state_input_port(self.panda.instance),
+        )
+        self.diagram: Diagram = builder.Build()
+        self.simulator = Simulator(self.diagram)
+        root = self.simulator.get_mutable_context()
+        self.context: Context = self.plant.GetMyMutableContextFromRoot(root)
+        self.panda.set_position(self.context, scene.panda_position)
+        self.panda.set_opening(self.context, scene.hand_opening)
+
+    def pose(self, name: str) -> RigidTransform:
+        """True pose of an object."""
+        body = self.plant.GetBodyByName(name, self.plant.GetModelInstanceByName(name))
+        return self.plant.EvalBodyPoseInWorld(self.context, body)
+
+    def penetration(self) -> float:
+        """Deepest overlap (m) of any two geometries."""
+        query = self.plant.get_geometry_query_input_port().Eval(self.context)
+        return max((pair.depth for pair in query.ComputePointPairPenetration()), default=0.0)
