@@ -1,6 +1,7 @@
 """A robot as inverse kinematics sees it: geometry, limits and the joints that may move."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -30,12 +31,12 @@ class PlanningRobot:
         """Itself: it never changes, and Drake copies the states that hold it."""
         return self
 
-    @property
+    @cached_property
     def indices(self) -> np.ndarray:
         """Indices of the active joints among the plant's positions."""
         return np.flatnonzero([self.active[i] for i in range(self.active.size())])
 
-    @property
+    @cached_property
     def limits(self) -> JointLimits:
         """Limits of the active joints (rad, rad/s, rad/s^2)."""
         return JointLimits(plant=self.checker.plant(), active_dof=self.active)
