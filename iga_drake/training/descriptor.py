@@ -129,9 +129,10 @@ def train_descriptor(
     minutes: float = float("inf"),
     resume: bool = True,
     initial: Path | None = None,
-    checkpoint_every: int = 250,
+    checkpoint_every: int = 200,
+    stop_at: int | None = None,
 ) -> dict:
-    """Trains until `config.steps` or `minutes`; writes `output`/descriptor.safetensors (EMA weights)
+    """Trains until `config.steps`, `stop_at` or `minutes`; writes `output`/descriptor.safetensors (EMA weights)
     and `output`/state.safetensors (all that resuming needs). Returns the model card."""
     config, samples = config or DescriptorTraining(), samples or SampleConfig()
     state_path = output / "state.safetensors"
@@ -166,7 +167,6 @@ def train_descriptor(
     log = (output / "log.jsonl").open("a")
     began = time.monotonic()
     recent: list[dict] = []
-    card: dict = {}
 
     def write() -> dict:
         card = {
@@ -191,7 +191,8 @@ def train_descriptor(
         return card
 
     batches = _batches(step, config, samples)
-    while step < config.steps and time.monotonic() - began < 60 * minutes:
+    last = config.steps if stop_at is None else min(stop_at, config.steps)
+    while step < last and time.monotonic() - began < 60 * minutes:
         batch = {k: v.to(device) for k, v in next(batches).items()}
         for group in optimizer.param_groups:
             group["lr"] = _learning_rate(step, config)
@@ -220,6 +221,6 @@ def train_descriptor(
                     flush=True,
                 )
         if step % checkpoint_every == 0:
-            card = write()
+            write()
     return write()
 

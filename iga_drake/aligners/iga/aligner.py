@@ -57,7 +57,8 @@ class IgaAligner:
             from iga_drake.aligners.iga.weights import load_descriptor
 
             net, _ = load_descriptor(Path(weights) if weights else default_weights())
-        self._net = net.eval()
+        # Double precision: choices between near ties must not depend on the clouds' frame.
+        self._net = net.eval().double()
         self.config = config or IgaConfig()
         self.voting = voting or VotingConfig()
 
@@ -105,14 +106,14 @@ class IgaAligner:
         points = torch.stack([p for p, _ in prepared])  # (2 (D + 1), P, 3)
         index = furthest_point_sampling(points, self.config.nodes)
         nodes = torch.gather(points, 1, index[..., None].expand(-1, -1, 3))
-        descriptors = self._net(points.float(), index)
+        descriptors = self._net(points, index)
         half = len(clouds) // 2
         generator = torch.Generator().manual_seed(seed)
         matches: list[list[Match]] = []
         for test in (half - 1, len(clouds) - 1):
             row = []
             for d in range(test - half + 1, test):
-                logits = self._net.similarity(descriptors[test], descriptors[d]).double()
+                logits = self._net.similarity(descriptors[test], descriptors[d])
                 # The demonstration's two objects share one frame: put its centroid back.
                 goal = nodes[d] + prepared[d][1]
                 row.append(match_object(logits, nodes[test], goal, self.voting, generator))

@@ -1,0 +1,61 @@
+"""The descriptor network: invariances by axiom, over random clouds."""
+
+import pytest
+import torch
+
+from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
+from iga_drake.geometry.clouds import furthest_point_sampling
+from iga_drake.geometry.se3 import random_rotations
+
+
+@pytest.fixture(scope="module")
+def net() -> DescriptorNet:
+    torch.manual_seed(0)
+    return DescriptorNet(DescriptorConfig(layers=2)).double()
+
+
+@pytest.fixture
+def cloud() -> tuple[torch.Tensor, torch.Tensor]:
+    points = torch.randn(4, 200, 3, generator=torch.Generator().manual_seed(1)).double() * 0.1
+    return points, furthest_point_sampling(points, 24)
+
+
+def test_descriptors_are_unit_vectors(net: DescriptorNet, cloud) -> None:
+    norm = net(*cloud).norm(dim=-1)
+    torch.testing.assert_close(norm, torch.ones_like(norm))
+
+
+def test_invariant_under_rigid_motions(net: DescriptorNet, cloud) -> None:
+    points, nodes = cloud
+    R = random_rotations(4, generator=torch.Generator().manual_seed(2))
+    moved = points @ R.transpose(1, 2) + torch.randn(4, 1, 3, dtype=torch.float64)
+    torch.testing.assert_close(net(moved, nodes), net(points, nodes), atol=1e-6, rtol=0)
+
+
+def test_follows_a_permutation_of_points_and_nodes(net: DescriptorNet, cloud) -> None:
+    points, nodes = cloud
+    order = torch.randperm(200)
+    back = order.argsort()
+    torch.testing.assert_close(net(points[:, order], back[nodes]), net(points, nodes))
+    shuffle = torch.randperm(24)
+    torch.testing.assert_close(net(points, nodes[:, shuffle]), net(points, nodes)[:, shuffle])
+
+
+def test_independent_of_density_of_points(net: DescriptorNet, cloud) -> None:
+    points, nodes = cloud
+    torch.testing.assert_close(net(points.repeat(1, 3, 1), nodes), net(points, nodes))
+
+
+def test_tells_left_from_right(net: DescriptorNet, cloud) -> None:
+    points, nodes = cloud
+    mirror = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
+    assert (net(points * mirror, nodes) - net(points, nodes)).abs().max() > 1e-3
+
+
+def test_gradients_match_finite_differences() -> None:
+    torch.manual_seed(0)
+    small = DescriptorNet(DescriptorConfig(layers=1, scalars=8, vectors=4, heads=2)).double()
+    points = torch.randn(1, 30, 3, dtype=torch.float64, requires_grad=True)
+    nodes = torch.arange(6)[None]
+    # The window of a shell reads positions too, so the check covers every path to the points.
+    assert torch.autograd.gradcheck(lambda x: small(x, nodes), (points,), atol=1e-5)

@@ -1,0 +1,52 @@
+"""Clouds and estimates are checked at the boundary."""
+
+import numpy as np
+import pytest
+
+from iga_drake.aligners.protocol import Alignment, AlignerError, PoseEstimate, check_cloud
+from iga_drake.aligners.registry import ALIGNERS, make_aligner
+
+CLOUD = np.random.default_rng(0).normal(size=(64, 3)) * 0.05
+
+
+@pytest.mark.parametrize(
+    ("cloud", "message"),
+    [
+        (np.zeros((0, 3)), r"grasped: 0 points, at least 16"),
+        (np.zeros((40, 2)), r"grasped: expected an array of shape \(P, 3\), got \(40, 2\)"),
+        (np.full((40, 3), np.nan), r"grasped: 40 of 40 points are not finite"),
+    ],
+)
+def test_bad_clouds_are_named(cloud: np.ndarray, message: str) -> None:
+    with pytest.raises(AlignerError, match=message):
+        check_cloud(cloud, "grasped")
+
+
+def test_an_alignment_checks_both_clouds() -> None:
+    with pytest.raises(AlignerError, match=r"Alignment\.target"):
+        Alignment(CLOUD, CLOUD[:3])
+
+
+def test_an_estimate_needs_poses_of_one_length() -> None:
+    with pytest.raises(AlignerError, match="energies"):
+        PoseEstimate(np.eye(4)[None], np.zeros(2), np.ones(1))
+    with pytest.raises(AlignerError, match="poses"):
+        PoseEstimate(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0))
+
+
+def test_an_unknown_aligner_lists_the_known_ones() -> None:
+    with pytest.raises(AlignerError, match="icp, iga"):
+        make_aligner("magic")
+
+
+@pytest.mark.parametrize("name", sorted(ALIGNERS))
+def test_every_aligner_refuses_bad_input(name: str) -> None:
+    aligner = make_aligner(name)
+    assert aligner.name == name
+    with pytest.raises(AlignerError, match="context is empty"):
+        aligner.align((), CLOUD, CLOUD)
+    context = (Alignment(CLOUD, CLOUD),)
+    with pytest.raises(AlignerError, match="grasped"):
+        aligner.align(context, CLOUD[:2], CLOUD)
+    with pytest.raises(AlignerError, match="target"):
+        aligner.align(context, CLOUD, np.full((40, 3), np.inf))
