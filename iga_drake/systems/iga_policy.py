@@ -104,7 +104,7 @@ class IgaPolicy(LeafSystem):
 
 
 class _Pull:
-    """`PolicyInputs` read from the ports of one context."""
+    """`PolicyInputs` read from the ports of one context, copied: Drake reuses its cache."""
 
     def __init__(self, policy: IgaPolicy, context: Context) -> None:
         self._policy = policy
@@ -126,10 +126,10 @@ class _Pull:
         return tuple(name for name, counts in self._read(port).items() if counts.valid == 0)
 
     def pose(self) -> RigidTransform:
-        return self._read(self._policy._pose_input)
+        return RigidTransform(self._read(self._policy._pose_input))
 
     def position(self) -> np.ndarray:
-        return self._read(self._policy._position_input)
+        return self._read(self._policy._position_input).copy()
 
     def follower(self) -> FollowerStatus:
         return self._read(self._policy._follower_input)

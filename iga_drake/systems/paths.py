@@ -61,13 +61,17 @@ class LinePath:
 
     X_WStart: RigidTransform
     X_WGoal: RigidTransform
-    nominal: np.ndarray | None = None  # posture for the null space (rad)
+    nominal: np.ndarray | None = None  # posture for the null space at the goal (rad)
+    # Posture at the start: the nominal one moves from here, as a jump would jerk the joints.
+    start: np.ndarray | None = None
 
     def pose(self, share: float) -> RigidTransform:
         return interpolate_pose(self.X_WStart, self.X_WGoal, share)
 
     def posture(self, share: float) -> np.ndarray | None:
-        return self.nominal
+        if self.nominal is None or self.start is None:
+            return self.nominal
+        return self.start + share * (self.nominal - self.start)
 
     def duration(self, linear_speed: float, angular_speed: float) -> float:
         distance, angle = pose_error(self.X_WStart, self.X_WGoal)
@@ -137,7 +141,7 @@ def plan_path(
     goal = nominal
     if goal is None or max(pose_error(solver.pose(goal), X_WGoal)) > 1e-3:
         goal = solver.solve(X_WGoal, near=q)
-    line = LinePath(X_WStart, X_WGoal, goal if nominal is None else nominal)
+    line = LinePath(X_WStart, X_WGoal, goal if nominal is None else nominal, q)
     if goal is None or can_follow(robot, q, line):
         return line
     for postures in ([q, goal], [q, robot.home, goal]):

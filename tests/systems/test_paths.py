@@ -80,3 +80,11 @@ def test_a_goal_out_of_reach_leaves_the_line():
     path = plan_path(solver, q=q, X_WStart=solver.pose(q), X_WGoal=X_WGoal)
     assert isinstance(path, LinePath)
     assert not can_follow(panda_robot(), q, path)
+
+
+def test_a_line_moves_the_nominal_posture_evenly_from_its_start():
+    start, nominal = np.zeros(7), np.linspace(-1.0, 1.0, 7)
+    line = LinePath(RigidTransform(), RigidTransform([0.1, 0, 0]), nominal, start)
+    for share in (0.0, 0.25, 1.0):
+        np.testing.assert_allclose(line.posture(share), share * nominal, atol=1e-12)
+    assert LinePath(RigidTransform(), RigidTransform(), nominal).posture(0.0) is nominal
