@@ -98,7 +98,7 @@ class ShapeInstance:
         object.__setattr__(self, "frames", frames)
         object.__setattr__(self, "convex_pieces", pieces)
 
-    def _require(self, condition: bool, message: str) -> None:
+    def _require(self, condition: bool | np.bool_, message: str) -> None:
         if not condition:
             raise ShapeError(f"ShapeInstance '{self.family}': {message}")
 

@@ -78,15 +78,15 @@ def profile(parameters: dict[str, float]) -> surfaces.ShellProfile:
 
 def _handle_path(p: dict[str, float], shell: surfaces.ShellProfile) -> np.ndarray:
     """(HANDLE_RINGS, 3) from the middle of the wall outwards along +x."""
-    z = p["height"] - 0.5 * p["handle_height"] - 0.002
+    height = p["height"] - 0.5 * p["handle_height"] - 0.002
     wall = (shell.outer + shell.inner) / 2
-    start = np.interp(z, wall[:, 1], wall[:, 0])
+    start = np.interp(height, wall[:, 1], wall[:, 0])
     s = np.linspace(0.0, 1.0, HANDLE_RINGS)
     tilt = p["handle_tilt"] + p["handle_curve"] * s
     step = p["handle_length"] / (HANDLE_RINGS - 1)
     middle = (tilt[1:] + tilt[:-1]) / 2
     x = start + step * np.concatenate([[0.0], np.cumsum(np.cos(middle))])
-    z = z + step * np.concatenate([[0.0], np.cumsum(np.sin(middle))])
+    z = height + step * np.concatenate([[0.0], np.cumsum(np.sin(middle))])
     return np.column_stack([x, np.zeros_like(x), z])
 
 

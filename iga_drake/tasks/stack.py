@@ -168,16 +168,14 @@ class Stack(Task):
         )
         X_EO = X_OE.inverse()
         colors = rng.permutation(len(_COLORS))
-        objects = tuple(
-            SceneObject(
-                name,
-                role,
-                write_sdf(shapes[name], folder, name=name, color=_COLORS[colors[i]], friction=0.7),
-                X_WO,
-            )
-            for i, (name, role, X_WO) in enumerate(
-                ((TARGET, "target", _place(rng)), (HELD, "grasped", _start_pose() @ X_EO))
-            )
+
+        def sdf(name: str, color: int) -> str:
+            rgb = _COLORS[colors[color]]
+            return write_sdf(shapes[name], folder, name=name, color=rgb, friction=0.7)
+
+        objects = (
+            SceneObject(TARGET, "target", sdf(TARGET, 0), _place(rng)),
+            SceneObject(HELD, "grasped", sdf(HELD, 1), _start_pose() @ X_EO),
         )
         return Scene(
             objects=objects,
@@ -200,8 +198,8 @@ class Stack(Task):
         that the hand is between it and the robot's base."""
         shapes = scene.privileged["shapes"]
         X_AE = X_WO[HELD].inverse() @ X_WE
-        profiles = [bowl.profile(shapes[name].parameters) for name in (HELD, TARGET)]
-        height = release_height(*profiles, X_AE, (0.005, RELEASE_OPENING))
+        held, target = (bowl.profile(shapes[name].parameters) for name in (HELD, TARGET))
+        height = release_height(held, target, X_AE, (0.005, RELEASE_OPENING))
         p_WB = X_WO[TARGET].translation()
         p_AE = X_AE.translation()
         yaw = np.arctan2(-p_WB[1], -p_WB[0]) - np.arctan2(p_AE[1], p_AE[0])
