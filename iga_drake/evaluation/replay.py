@@ -84,6 +84,7 @@ def show_demonstrations(
     meshcat: Meshcat, demonstrations: DemonstrationSet, spacing: float = 0.6
 ) -> None:
     """Shows each demonstration beside the other, along y: both clouds and the waypoints' frames."""
+    meshcat.SetCameraPose(np.array([2.3, 0.0, 1.0]), np.array([0.5, 0.0, 0.0]))
     for index, demonstration in enumerate(demonstrations.demonstrations):
         root = f"demonstrations/{index}"
         show_cloud(meshcat, f"{root}/target cloud", demonstration.target, TARGET_COLOR)

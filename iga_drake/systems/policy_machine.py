@@ -155,7 +155,9 @@ class PolicyMachine:
             return memory
         supervisor = inputs.supervisor()
         if supervisor.holding:
-            return self._fail(memory, inputs, now, f"supervisor: {supervisor.reason}", "contact")
+            return self._fail(
+                memory, inputs, now, f"supervisor: {supervisor.reason}", _cause(supervisor.reason)
+            )
         match phase:
             case Phase.OBSERVE_TARGET:
                 return self._observe(memory, inputs, now)
@@ -351,3 +353,9 @@ class PolicyMachine:
             f"{np.degrees(follower.rotation_error):.0f} deg are left"
         )
         return self._fail(memory, inputs, now, reason, "time")
+
+
+def _cause(supervisor_reason: str) -> Cause:
+    """Torque and lag come from touching something, everything else from the commanded motion."""
+    touched = any(word in supervisor_reason for word in ("torque", "tracking error"))
+    return "contact" if touched else "IK"

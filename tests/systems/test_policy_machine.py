@@ -183,11 +183,19 @@ def test_a_present_pose_that_is_never_reached_fails():
     assert "present grasped: not reached within 5 s" in memory.status.reason
 
 
-def test_a_holding_supervisor_ends_the_episode_with_its_reason():
-    inputs = FakeInputs(supervisor_status=SupervisorStatus(True, "contact force 60 N"))
+@pytest.mark.parametrize(
+    ("reason", "cause"),
+    [
+        ("external torque of 60.0 N m at joint 2 is above 40.0 N m for 0.05 s", "contact"),
+        ("tracking error of joint 1 is 0.300 rad, outside [-0.200, 0.200]", "contact"),
+        ("measured velocity of joint 1 is 2.185 rad/s, outside [-2.175, 2.175]", "IK"),
+    ],
+)
+def test_a_holding_supervisor_ends_the_episode_with_its_reason(reason: str, cause: str):
+    inputs = FakeInputs(supervisor_status=SupervisorStatus(True, reason))
     memory, _ = run(make_machine(), inputs)
-    assert memory.status.phase is Phase.FAILED
-    assert "supervisor: contact force 60 N" in memory.status.reason
+    assert (memory.status.phase, memory.status.cause) == (Phase.FAILED, cause)
+    assert f"supervisor: {reason}" in memory.status.reason
 
 
 def test_slow_inference_is_refused():
