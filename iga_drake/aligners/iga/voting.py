@@ -7,6 +7,7 @@ parts (i of A, j of B) then proposes `X_B^-1 X_A` once per demonstration; pairs 
 the demonstrations are what the task is about.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -27,7 +28,8 @@ class VotingConfig:
     """Scales of the vote. Lengths in metres unless said otherwise."""
 
     # Coarse hypotheses: random triplets drawn, kept for refinement, and kept at the end.
-    triplets: int = 256
+    triplets: int = 384
+    stretch: float = 2.0
     refined: int = 24
     hypotheses: int = 6
     # Width of a geometric match, in units of the cloud's root-mean-square radius.
@@ -75,6 +77,17 @@ def _soft_points(log_p: Tensor, moved: Tensor, y: Tensor, sigma: float) -> tuple
     return logits.softmax(-1) @ y, logits.logsumexp(-1)
 
 
+def _sides(triangle: Tensor) -> Tensor:
+    """Lengths (..., 3) of the sides of triangles (..., 3, 3)."""
+    return (triangle - triangle.roll(1, -2)).norm(dim=-1)
+
+
+def _area(sides: Tensor) -> Tensor:
+    """Areas (...) from the lengths of the sides (..., 3), Heron's formula."""
+    half = sides.sum(-1) / 2
+    return (half * (half[..., None] - sides).prod(-1)).clamp_min(0).sqrt()
+
+
 def global_hypotheses(
     logits: Tensor, x: Tensor, y: Tensor, config: VotingConfig, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
@@ -91,11 +104,17 @@ def global_hypotheses(
         log_p[rows].exp().flatten(0, 1).double(), 1, generator=generator
     ).reshape(T, 3)
     X = kabsch(x[rows], y[columns])
+    # Slender triangles leave the rotation open, and a side that changed its length by more than
+    # `stretch` is no match.
+    sides = [_sides(points) for points in (x[rows], y[columns])]
+    area = torch.minimum(*(_area(s) for s in sides))
+    ratio = (sides[1] / sides[0].clamp_min(1e-6)).clamp_min(1e-6).log().abs().amax(-1)
+    sound = (area > 0.03) & (ratio < math.log(config.stretch))
     # Anchor nodes only: the score needs no more, and this is the costly part.
     anchors = slice(0, min(M, 40))
     _, likelihood = _soft_points(log_p[anchors], transform(X, x[anchors]), y, config.coarse_sigma)
-    keep = likelihood.mean(-1).topk(min(config.refined, T)).indices
-    X = X[keep]
+    score = torch.where(sound, likelihood.mean(-1), likelihood.mean(-1) - 1e3)
+    X = X[score.topk(min(config.refined, T)).indices]
     for _ in range(4):
         soft, likelihood = _soft_points(log_p, transform(X, x), y, config.coarse_sigma)
         weight = (likelihood - likelihood.amax(-1, keepdim=True)).exp().clamp_min(1e-3).sqrt()
