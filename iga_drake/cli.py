@@ -287,7 +287,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if others and parsed.command not in DELEGATES:
         parser.error(f"unrecognized arguments: {' '.join(others)}")
     parsed.options = others
-    logging.getLogger("drake").setLevel(logging.WARNING)
+    # Drake sets its logger's level when it is imported, later than this: a filter stays.
+    logging.getLogger("drake").addFilter(lambda record: record.levelno >= logging.WARNING)
     try:
         return COMMANDS[parsed.command][2](parsed)
     except IgaDrakeError as error:
