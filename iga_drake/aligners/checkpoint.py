@@ -18,9 +18,7 @@ class CheckpointError(IgaDrakeError):
     """A checkpoint file is missing, damaged, or made for something else."""
 
 
-def save_checkpoint(
-    path: Path, tensors: dict[str, torch.Tensor], *, kind: str, card: dict
-) -> None:
+def save_checkpoint(path: Path, tensors: dict[str, torch.Tensor], *, kind: str, card: dict) -> None:
     """Writes `tensors` with a JSON `card` to `path` (temporary file, then renamed)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     metadata = {"format": FORMAT, "version": str(VERSION), "kind": kind, "card": json.dumps(card)}
@@ -33,7 +31,9 @@ def load_checkpoint(path: Path, *, kind: str) -> tuple[dict[str, torch.Tensor], 
     """Tensors and card of a checkpoint of this `kind`; `CheckpointError` names what is wrong."""
     path = Path(path)
     if not path.is_file():
-        raise CheckpointError(f"{path}: no such checkpoint; train one with `iga train` or name another")
+        raise CheckpointError(
+            f"{path}: no such checkpoint; train one with `iga train` or name another"
+        )
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

@@ -1,13 +1,14 @@
 """The ICP baseline: registers a demonstration's objects with the test objects, rigidly.
 
-Per demonstration the grasped and the target cloud are registered with the test's (Open3D, multi-start,
+Per demonstration the grasped and the target cloud are registered with the test's (Open3D,
+multi-start,
 point-to-plane); with `X_A`, `X_B` from demonstration to test the answer is `X_B X_A^-1`. The best
 demonstration is the one with the smallest mean distance of both registrations.
 """
 
 import numpy as np
 
-from iga_drake.aligners.protocol import Alignment, AlignerError, PoseEstimate, check_cloud
+from iga_drake.aligners.protocol import AlignerError, Alignment, PoseEstimate, check_cloud
 
 
 def _open3d():
@@ -29,7 +30,8 @@ def _starts(count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 class IcpAligner:
-    """`Aligner` by multi-start ICP. `starts` rotations, `refined` of them finished point-to-plane."""
+    """`Aligner` by multi-start ICP. `starts` rotations, `refined` of them finished
+    point-to-plane."""
 
     name = "icp"
 
@@ -79,7 +81,8 @@ class IcpAligner:
         *,
         seed: int = 0,
     ) -> PoseEstimate:
-        """See `Aligner.align`. One mode per demonstration; the energy is the mean distance in cm."""
+        """See `Aligner.align`. One mode per demonstration; the energy is the mean distance in
+        cm."""
         if not context:
             raise AlignerError("icp: the context is empty: give at least one demonstration")
         o3d = _open3d()

@@ -65,7 +65,9 @@ class PoseEstimate:
         for name in ("energies", "probabilities"):
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape != (len(poses),):
-                raise AlignerError(f"PoseEstimate.{name}: expected ({len(poses)},), got {value.shape}")
+                raise AlignerError(
+                    f"PoseEstimate.{name}: expected ({len(poses)},), got {value.shape}"
+                )
             object.__setattr__(self, name, value)
 
 

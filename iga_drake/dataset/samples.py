@@ -1,6 +1,7 @@
 """Consistently aligned object pairs as a pure function of (split, index).
 
-One sample (paper, "Generalisation Through Shape Augmentation"): two categories, N deformed instances of
+One sample (paper, "Generalisation Through Shape Augmentation"): two categories, N deformed
+instances of
 each with known correspondence, aligned so that the neighbourhood of one point on each object keeps
 its relative pose, seen by three depth cameras. Every observed point carries its place on the
 canonical instance, in units of that instance's size.
@@ -68,7 +69,9 @@ def _instances(
     faces = meshes[0][1]
     if rng.random() < config.free_form_share or all(m is meshes[0] for m in meshes):
         deformer = LatticeDeformer(
-            amplitude=rng.uniform(0.0, 0.09), scale=rng.uniform(0.0, 0.22), cells=int(rng.integers(3, 5))
+            amplitude=rng.uniform(0.0, 0.09),
+            scale=rng.uniform(0.0, 0.22),
+            cells=int(rng.integers(3, 5)),
         )
         vertices = np.stack([deformer.deform(v, int(rng.integers(1 << 31))) for v in vertices])
     extent = np.ptp(vertices, axis=1).max(1)

@@ -1,6 +1,7 @@
 """Alignment error of an aligner on generated samples (METHOD: context of 4, one test pair).
 
-The test pair's grasped cloud starts at a Haar-random pose. Translation error: distance that the centroid
+The test pair's grasped cloud starts at a Haar-random pose. Translation error: distance that the
+centroid
 of the grasped cloud ends from where it belongs; rotation error: geodesic angle.
 """
 
@@ -38,7 +39,8 @@ class AlignmentErrors:
         rates = "  ".join(f"{100 * rate:5.1f}" for rate in self.success)
         return (
             f"{self.aligner:<10} {self.split:<18} {self.count:>5}  "
-            f"{self.translation_mean:5.2f} ± {self.translation_std:4.2f} ({self.translation_median:4.2f})  "
+            f"{self.translation_mean:5.2f} ± {self.translation_std:4.2f} "
+            f"({self.translation_median:4.2f})  "
             f"{self.rotation_mean:5.1f} ± {self.rotation_std:4.1f} ({self.rotation_median:4.1f})  "
             f"{rates}  {self.seconds_median:6.2f}"
         )
@@ -77,9 +79,7 @@ def evaluate_alignment(aligner: Aligner, split: str, count: int) -> AlignmentErr
     for index in range(count):
         sample = make_sample(split, index)
         N = sample.points.shape[1]
-        context = tuple(
-            Alignment(sample.points[0, n], sample.points[1, n]) for n in range(N - 1)
-        )
+        context = tuple(Alignment(sample.points[0, n], sample.points[1, n]) for n in range(N - 1))
         start = random_pose(index)
         grasped = sample.points[0, -1] @ start[:3, :3].T + start[:3, 3]
         began = time.perf_counter()

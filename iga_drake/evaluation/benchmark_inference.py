@@ -1,4 +1,5 @@
-"""`iga benchmark inference`: time to infer one waypoint, learned aligner beside ICP in the same run."""
+"""`iga benchmark inference`: time to infer one waypoint, learned aligner beside ICP in the same
+run."""
 
 import argparse
 import json
@@ -54,6 +55,8 @@ def main(arguments: argparse.Namespace) -> int:
         f"{arguments.threads} threads"
     )
     for name, row in result.items():
-        print(f"  {name:<4} {row['median_s']:.3f} s median ({row['min_s']:.3f} to {row['max_s']:.3f})")
+        print(
+            f"  {name:<4} {row['median_s']:.3f} s median ({row['min_s']:.3f} to {row['max_s']:.3f})"
+        )
     print(f"  iga / icp: {ratio:.2f}")
     return 0

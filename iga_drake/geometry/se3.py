@@ -59,9 +59,9 @@ def so3_log(rotation: Tensor) -> Tensor:
     symmetric = (rotation + rotation.transpose(-1, -2)) / 2
     symmetric = symmetric + torch.eye(3, dtype=rotation.dtype, device=rotation.device)
     column = symmetric.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    axis = torch.gather(
-        symmetric, -1, column[..., None, None].expand(*column.shape, 3, 1)
-    ).squeeze(-1)
+    axis = torch.gather(symmetric, -1, column[..., None, None].expand(*column.shape, 3, 1)).squeeze(
+        -1
+    )
     axis = axis / axis.norm(dim=-1, keepdim=True)
     sign = torch.where((axis * vee).sum(-1, keepdim=True) < 0, -1.0, 1.0)
     near_pi = (angle > math.pi - 1e-3)[..., None]

@@ -1,6 +1,7 @@
 """Abstract composite shapes: random assemblies of closed parts, with part-wise variation.
 
-A category is drawn once (which parts, where they sit); its instances vary each part's size, bend and
+A category is drawn once (which parts, where they sit); its instances vary each part's size, bend
+and
 place. All instances of a category share faces and vertex order.
 """
 
@@ -108,7 +109,9 @@ def _surface(
         r = 1 + sum(w * np.sin((k + 1) * np.pi * z + k) for k, w in enumerate(waves)) * vary[0]
         r = np.clip(r, 0.25, 2.0) * size[0] / 2
         z = (z - 0.5) * size[2]
-        profile = np.column_stack((np.concatenate(([0], r, [0])), np.concatenate(([z[0]], z, [z[-1]]))))
+        profile = np.column_stack(
+            (np.concatenate(([0], r, [0])), np.concatenate(([z[0]], z, [z[-1]])))
+        )
         return lathe(profile, segments=20, ratio=float(np.clip(size[1] / size[0], 0.4, 1.5)))
     if kind == "vessel":
         z = np.linspace(0, 1, 10)
@@ -117,14 +120,15 @@ def _surface(
         outer = np.column_stack((np.maximum(r, 0.01), z * size[2]))
         wall = float(min(0.004, 0.2 * size.min()))
         shell = shell_profile(outer, thickness=wall, base_thickness=wall * 1.2)
-        body = lathe(getattr(shell, "profile", shell), segments=24)
+        body = lathe(shell.profile, segments=24)
         return Surface(body.vertices - [0, 0, size[2] / 2], body.faces)
     width, height = size[0] * 0.3, size[1] * 0.3
     length = float(size[2]) * 1.4
     bend = fixed.uniform(-0.6, 0.6, 2) * vary[:2]
     if kind == "loop":
         path = bezier(
-            length * np.array([[-0.3, 0, 0], [-0.3 + bend[0], 0, 1.0], [0.3, 0, 1.0], [0.3, 0, 0]]), 14
+            length * np.array([[-0.3, 0, 0], [-0.3 + bend[0], 0, 1.0], [0.3, 0, 1.0], [0.3, 0, 0]]),
+            14,
         )
         return tube(path, width=width, height=height, up=(0.0, 1.0, 0.01), segments=10)
     path = bezier(length * np.array([[0, 0, 0], [0, 0, 0.5], [bend[0], bend[1], 1.0]]), 12)

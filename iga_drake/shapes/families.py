@@ -14,6 +14,7 @@ from iga_drake.shapes.surfaces import (
     ellipsoid,
     join,
     lathe,
+    loft,
     prism,
     ring_tube,
     rounded_box,
@@ -49,8 +50,7 @@ def _vessel(rng: Rng, radius: float, height: float, *, taper=(0.6, 1.25), belly=
     outer = np.column_stack((r, z * height))
     wall = rng.uniform(0.002, 0.005)
     profile = shell_profile(outer, thickness=wall, base_thickness=rng.uniform(0.004, 0.01))
-    points = getattr(profile, "profile", profile)
-    surface = lathe(points, segments=32, exponent=rng.uniform(2.0, 3.0))
+    surface = lathe(profile.profile, segments=32, exponent=rng.uniform(2.0, 3.0))
     return surface, lambda h: float(np.interp(h, z * height, r))
 
 
@@ -70,9 +70,12 @@ def mug(rng: Rng) -> list[Surface]:
     height, radius = rng.uniform(0.07, 0.14), rng.uniform(0.03, 0.055)
     body, radius_at = _vessel(rng, radius, height)
     handle = _loop_handle(
-        rng, radius_at, height * rng.uniform(0.12, 0.35), height * rng.uniform(0.65, 0.9),
+        rng,
+        radius_at,
+        height * rng.uniform(0.12, 0.35),
+        height * rng.uniform(0.65, 0.9),
         rng.uniform(0.03, 0.06),
-    )  # fmt: skip
+    )
     return [body, handle]
 
 
@@ -80,20 +83,34 @@ def teapot(rng: Rng) -> list[Surface]:
     height, radius = rng.uniform(0.09, 0.18), rng.uniform(0.04, 0.07)
     body, radius_at = _vessel(rng, radius, height, belly=(0.1, 0.7))
     handle = _loop_handle(
-        rng, radius_at, height * rng.uniform(0.1, 0.35), height * rng.uniform(0.65, 0.95),
+        rng,
+        radius_at,
+        height * rng.uniform(0.1, 0.35),
+        height * rng.uniform(0.65, 0.95),
         rng.uniform(0.04, 0.08),
-    )  # fmt: skip
+    )
     foot = height * rng.uniform(0.25, 0.6)
     start = np.array([-radius_at(foot) + 0.006, 0, foot])
     reach, rise = rng.uniform(0.04, 0.1), height * rng.uniform(0.8, 1.15) - foot
     path = bezier(
-        np.array([start, start + [-reach, 0, 0.1 * rise], start + [-reach * 0.8, 0, rise],
-                  start + [-reach * rng.uniform(1, 1.3), 0, rise]]), 14)  # fmt: skip
+        np.array(
+            [
+                start,
+                start + [-reach, 0, 0.1 * rise],
+                start + [-reach * 0.8, 0, rise],
+                start + [-reach * rng.uniform(1, 1.3), 0, rise],
+            ]
+        ),
+        14,
+    )
     wide = rng.uniform(0.02, 0.036)
     spout = tube(
-        path, width=np.linspace(wide, wide * rng.uniform(0.35, 0.8), 14),
-        height=np.linspace(wide, wide * rng.uniform(0.35, 0.8), 14), up=(0, 1, 0.01), segments=12,
-    )  # fmt: skip
+        path,
+        width=np.linspace(wide, wide * rng.uniform(0.35, 0.8), 14),
+        height=np.linspace(wide, wide * rng.uniform(0.35, 0.8), 14),
+        up=(0, 1, 0.01),
+        segments=12,
+    )
     return [body, handle, spout]
 
 
@@ -101,11 +118,17 @@ def jug(rng: Rng) -> list[Surface]:
     height, radius = rng.uniform(0.15, 0.28), rng.uniform(0.045, 0.08)
     body, radius_at = _vessel(rng, radius, height, taper=(0.7, 1.4))
     handle = _loop_handle(
-        rng, radius_at, height * rng.uniform(0.1, 0.4), height * rng.uniform(0.7, 0.97),
+        rng,
+        radius_at,
+        height * rng.uniform(0.1, 0.4),
+        height * rng.uniform(0.7, 0.97),
         rng.uniform(0.04, 0.09),
-    )  # fmt: skip
-    lip = ellipsoid((rng.uniform(0.015, 0.035), rng.uniform(0.01, 0.02), rng.uniform(0.01, 0.03)),
-                    rings=9, segments=16)  # fmt: skip
+    )
+    lip = ellipsoid(
+        (rng.uniform(0.015, 0.035), rng.uniform(0.01, 0.02), rng.uniform(0.01, 0.03)),
+        rings=9,
+        segments=16,
+    )
     return [body, handle, transform(lip, _at((-radius_at(height), 0, height - 0.01)))]
 
 
@@ -144,8 +167,14 @@ def hammer(rng: Rng) -> list[Surface]:
     path = np.column_stack((np.zeros(16), np.zeros(16), np.linspace(0, length, 16)))
     bulge = 1 + rng.uniform(-0.2, 0.4) * np.sin(np.linspace(0, 2.5 * np.pi, 16)) * 0.5
     thick = rng.uniform(0.018, 0.034)
-    handle = tube(path, width=thick * bulge, height=thick * rng.uniform(0.6, 1) * bulge, up=(1, 0, 0),
-                  exponent=rng.uniform(2, 4), segments=14)  # fmt: skip
+    handle = tube(
+        path,
+        width=thick * bulge,
+        height=thick * rng.uniform(0.6, 1) * bulge,
+        up=(1, 0, 0),
+        exponent=rng.uniform(2, 4),
+        segments=14,
+    )
     reach, face = rng.uniform(0.07, 0.14), rng.uniform(0.02, 0.04)
     back = rng.uniform(0.35, 0.6)
     x = np.linspace(-back * reach, (1 - back) * reach, 14)
@@ -154,8 +183,13 @@ def hammer(rng: Rng) -> list[Surface]:
     taper = np.interp(
         x, [x[0], -0.1 * reach, 0.1 * reach, x[-1]], [rng.uniform(0.15, 0.9), 0.8, 0.8, 1]
     )
-    head = tube(head_path, width=face * rng.uniform(0.8, 1.3), height=face * taper,
-                exponent=rng.uniform(2, 5), segments=14)  # fmt: skip
+    head = tube(
+        head_path,
+        width=face * rng.uniform(0.8, 1.3),
+        height=face * taper,
+        exponent=rng.uniform(2, 5),
+        segments=14,
+    )
     return [handle, head]
 
 
@@ -165,18 +199,23 @@ def brush(rng: Rng) -> list[Surface]:
     fall = rng.uniform(0.02, 0.06)
     flare = rng.uniform(0.85, 1.25)
     outline = superellipse(32, rng.uniform(4, 8)) * [length * 0.46, wide * 0.42]
-    rings = [np.column_stack((outline * scale, np.full(32, z))) for scale, z in
-             ((flare, -fall), ((1 + flare) / 2, -fall / 2), (1.0, 0.0))]  # fmt: skip
-    from iga_drake.shapes.surfaces import loft
-
+    rings = [
+        np.column_stack((outline * scale, np.full(32, z)))
+        for scale, z in ((flare, -fall), ((1 + flare) / 2, -fall / 2), (1.0, 0.0))
+    ]
     bristles = loft(np.stack(rings))
     start = np.array([length / 2 - 0.01, 0, 0])
     reach = rng.uniform(0.1, 0.2)
     rise = rng.uniform(-0.02, 0.09)
     path = bezier(np.array([start, start + [reach / 2, 0, 0], start + [reach, 0, rise]]), 14)
     thick = rng.uniform(0.014, 0.026)
-    handle = tube(path, width=thick * rng.uniform(1, 1.6), height=thick * np.linspace(0.7, 1.2, 14),
-                  segments=12, caps=(0.002, 0.01))  # fmt: skip
+    handle = tube(
+        path,
+        width=thick * rng.uniform(1, 1.6),
+        height=thick * np.linspace(0.7, 1.2, 14),
+        segments=12,
+        caps=(0.002, 0.01),
+    )
     return [block, bristles, handle]
 
 
@@ -185,15 +224,19 @@ def ladle(rng: Rng) -> list[Surface]:
     angle = np.linspace(0.25, np.pi / 2, 12)
     outer = np.column_stack((radius * np.sin(angle), radius * depth * (1 - np.cos(angle))))
     profile = shell_profile(outer, thickness=0.0025, base_thickness=0.003)
-    cup = lathe(getattr(profile, "profile", profile), segments=28, ratio=rng.uniform(0.65, 1.0))
+    cup = lathe(profile.profile, segments=28, ratio=rng.uniform(0.65, 1.0))
     start = np.array([radius - 0.003, 0, radius * depth - 0.003])
     reach, tilt = rng.uniform(0.12, 0.25), rng.uniform(0.05, 1.3)
     direction = np.array([np.cos(tilt), 0, np.sin(tilt)]) * reach
     bend = np.array([0.3 * reach * rng.uniform(-0.5, 1), 0, 0])
     path = bezier(np.array([start, start + direction / 2 + bend * 0.5, start + direction]), 16)
-    handle = tube(path, width=np.linspace(0.008, rng.uniform(0.01, 0.028), 16),
-                  height=rng.uniform(0.005, 0.011), up=(-np.sin(tilt), 0.0, np.cos(tilt)),
-                  segments=10)  # fmt: skip
+    handle = tube(
+        path,
+        width=np.linspace(0.008, rng.uniform(0.01, 0.028), 16),
+        height=rng.uniform(0.005, 0.011),
+        up=(-np.sin(tilt), 0.0, np.cos(tilt)),
+        segments=10,
+    )
     return [cup, handle]
 
 
@@ -213,8 +256,16 @@ def chair(rng: Rng) -> list[Surface]:
         for sy in (-1, 1):
             top = np.array([sx * (depth / 2 - leg), sy * (width / 2 - leg), seat])
             foot = top + [sx * splay, sy * splay, -seat]
-            parts.append(tube(np.linspace(top, foot, 6), width=leg, height=leg, up=(1, 0, 0.01),
-                              exponent=4.0, segments=8))  # fmt: skip
+            parts.append(
+                tube(
+                    np.linspace(top, foot, 6),
+                    width=leg,
+                    height=leg,
+                    up=(1, 0, 0.01),
+                    exponent=4.0,
+                    segments=8,
+                )
+            )
     return parts
 
 
@@ -245,8 +296,9 @@ def shoe(rng: Rng) -> list[Surface]:
         path, width=width, height=height, exponent=rng.uniform(2.2, 3.5), segments=20, up=(0, 0, 1)
     )
     heel = rng.uniform(0.008, 0.03)
-    outline = np.column_stack((np.concatenate((t, t[::-1])) * length,
-                               np.concatenate((-width, width[::-1])) * 0.53))  # fmt: skip
+    outline = np.column_stack(
+        (np.concatenate((t, t[::-1])) * length, np.concatenate((-width, width[::-1])) * 0.53)
+    )
     sole = prism(outline, bottom=-heel, top=0.006)
     return [upper, sole]
 
@@ -258,9 +310,7 @@ def basket(rng: Rng) -> list[Surface]:
     )
     profile = shell_profile(outer, thickness=0.004, base_thickness=0.005)
     ratio = rng.uniform(0.55, 0.9)
-    body = lathe(
-        getattr(profile, "profile", profile), segments=40, ratio=ratio, exponent=rng.uniform(2, 7)
-    )
+    body = lathe(profile.profile, segments=40, ratio=ratio, exponent=rng.uniform(2, 7))
     rise = rng.uniform(0.05, 0.13)
     a = np.linspace(0, np.pi, 20)
     path = np.column_stack(
@@ -286,8 +336,15 @@ def dustpan(rng: Rng) -> list[Surface]:
         ),
         12,
     )
-    parts.append(tube(path, width=rng.uniform(0.018, 0.035), height=rng.uniform(0.012, 0.025), segments=12,
-                      caps=(0.002, 0.01)))  # fmt: skip
+    parts.append(
+        tube(
+            path,
+            width=rng.uniform(0.018, 0.035),
+            height=rng.uniform(0.012, 0.025),
+            segments=12,
+            caps=(0.002, 0.01),
+        )
+    )
     return parts
 
 
@@ -315,15 +372,28 @@ def hook_stand(rng: Rng) -> list[Surface]:
         top=0.015,
     )
     height = rng.uniform(0.18, 0.3)
-    pole = tube(np.column_stack((np.zeros(10), np.zeros(10), np.linspace(0.01, height, 10))),
-                width=rng.uniform(0.012, 0.03), height=rng.uniform(0.012, 0.03), up=(1, 0, 0), segments=12)  # fmt: skip
+    pole = tube(
+        np.column_stack((np.zeros(10), np.zeros(10), np.linspace(0.01, height, 10))),
+        width=rng.uniform(0.012, 0.03),
+        height=rng.uniform(0.012, 0.03),
+        up=(1, 0, 0),
+        segments=12,
+    )
     parts = [foot, pole]
     for level, side in ((rng.uniform(0.75, 0.95), 1.0), (rng.uniform(0.4, 0.65), -1.0)):
         start = np.array([0, 0, height * level])
         reach, rise = rng.uniform(0.05, 0.1) * side, rng.uniform(0.0, 0.05)
         path = bezier(np.array([start, start + [reach * 0.8, 0, 0], start + [reach, 0, rise]]), 12)
-        parts.append(tube(path, width=rng.uniform(0.008, 0.016), height=0.01, up=(0, 1, 0.01), segments=10,
-                          caps=(0.001, 0.004)))  # fmt: skip
+        parts.append(
+            tube(
+                path,
+                width=rng.uniform(0.008, 0.016),
+                height=0.01,
+                up=(0, 1, 0.01),
+                segments=10,
+                caps=(0.001, 0.004),
+            )
+        )
     return parts
 
 
@@ -344,8 +414,13 @@ def screwdriver(rng: Rng) -> list[Surface]:
     n = 10
     tip = np.interp(np.linspace(0, 1, n), [0, 0.8, 1], [1, 1, rng.uniform(0.15, 0.6)])
     wide = rng.uniform(0.006, 0.01)
-    rod = tube(np.column_stack((np.zeros(n), np.zeros(n), np.linspace(grip - 0.01, grip + shaft, n))),
-               width=wide, height=wide * tip, up=(1, 0, 0), segments=10)  # fmt: skip
+    rod = tube(
+        np.column_stack((np.zeros(n), np.zeros(n), np.linspace(grip - 0.01, grip + shaft, n))),
+        width=wide,
+        height=wide * tip,
+        up=(1, 0, 0),
+        segments=10,
+    )
     return [handle, rod]
 
 
@@ -389,7 +464,7 @@ FAMILIES: dict[str, Callable[[Rng], list[Surface]]] = {
         hook_stand,
         screwdriver,
         glasses_tray,
-    )  # fmt: skip
+    )
 }
 
 

@@ -13,12 +13,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("network", choices=("descriptor",), help="what to train")
     parser.add_argument("--out", type=Path, required=True, help="folder of weights, state and log")
     parser.add_argument("--steps", type=int, default=DescriptorTraining.steps)
-    parser.add_argument("--batch", type=int, default=DescriptorTraining.batch, help="samples a step")
+    parser.add_argument(
+        "--batch", type=int, default=DescriptorTraining.batch, help="samples a step"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after this long")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch on the CPU")
-    parser.add_argument("--initial", type=Path, help="start from these weights instead of at random")
+    parser.add_argument(
+        "--initial", type=Path, help="start from these weights instead of at random"
+    )
     parser.add_argument("--float32", action="store_true", help="no bfloat16 autocast")
 
 

@@ -1,6 +1,7 @@
 """Trains the dense descriptors by contrastive correspondence between the instances of a sample.
 
-Loss: for every ordered pair of instances of one object, cross-entropy between the match logits of each
+Loss: for every ordered pair of instances of one object, cross-entropy between the match logits of
+each
 node and a soft target, a Gaussian in the canonical space (InfoNCE with soft positives).
 """
 
@@ -132,7 +133,8 @@ def train_descriptor(
     checkpoint_every: int = 200,
     stop_at: int | None = None,
 ) -> dict:
-    """Trains until `config.steps`, `stop_at` or `minutes`; writes `output`/descriptor.safetensors (EMA weights)
+    """Trains until `config.steps`, `stop_at` or `minutes`; writes `output`/descriptor.safetensors
+    (EMA weights)
     and `output`/state.safetensors (all that resuming needs). Returns the model card."""
     config, samples = config or DescriptorTraining(), samples or SampleConfig()
     state_path = output / "state.safetensors"
@@ -146,7 +148,10 @@ def train_descriptor(
     net = DescriptorNet(model or DescriptorConfig()).to(device)
     names = [name for name, _ in net.named_parameters()]
     optimizer = torch.optim.AdamW(
-        net.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, betas=(0.9, 0.98)
+        net.parameters(),
+        lr=config.learning_rate,
+        weight_decay=config.weight_decay,
+        betas=(0.9, 0.98),
     )
     if tensors:
         net.load_state_dict({n: tensors[f"net.{n}"] for n in names})
@@ -179,7 +184,7 @@ def train_descriptor(
             "parameters": sum(p.numel() for p in net.parameters()),
         }
         save_checkpoint(output / "descriptor.safetensors", ema, kind=KIND, card=card)
-        state = {f"net.{n}": p for n, p in net.named_parameters()}
+        state: dict[str, Tensor] = {f"net.{n}": p for n, p in net.named_parameters()}
         state |= {f"ema.{n}": t for n, t in ema.items()}
         for n, p in net.named_parameters():
             # The last layer's vectors feed nothing: they have no gradient and no moments.
@@ -223,4 +228,3 @@ def train_descriptor(
         if step % checkpoint_every == 0:
             write()
     return write()
-

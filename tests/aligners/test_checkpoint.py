@@ -28,7 +28,9 @@ def test_a_missing_file(tmp_path: Path) -> None:
 def test_another_kind(tmp_path: Path) -> None:
     path = tmp_path / "x.safetensors"
     save_checkpoint(path, TENSORS, kind="other", card={})
-    with pytest.raises(CheckpointError, match=r"x\.safetensors: kind 'other'.*expected kind 'thing'"):
+    with pytest.raises(
+        CheckpointError, match=r"x\.safetensors: kind 'other'.*expected kind 'thing'"
+    ):
         load_checkpoint(path, kind="thing")
 
 

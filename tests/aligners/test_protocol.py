@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from iga_drake.aligners.protocol import Alignment, AlignerError, PoseEstimate, check_cloud
+from iga_drake.aligners.protocol import AlignerError, Alignment, PoseEstimate, check_cloud
 from iga_drake.aligners.registry import ALIGNERS, make_aligner
 
 CLOUD = np.random.default_rng(0).normal(size=(64, 3)) * 0.05

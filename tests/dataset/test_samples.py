@@ -33,7 +33,8 @@ def _fit(source: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _matched(sample, role: int, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points of alignments a and b with nearly the same canonical place, both in the neighbourhood."""
+    """Points of alignments a and b with nearly the same canonical place, both in the
+    neighbourhood."""
     pa, pb = sample.aligned[role, a], sample.aligned[role, b]
     ca, cb = sample.canonical[role, a][pa], sample.canonical[role, b][pb]
     distance = np.linalg.norm(ca[:, None] - cb[None], axis=-1)

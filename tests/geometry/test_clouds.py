@@ -32,7 +32,8 @@ def test_too_many_samples_are_refused() -> None:
 
 def test_voxel_downsample_matches_open3d() -> None:
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (5000, 3))
-    # Open3D's grid starts half a voxel below the minimum: give it the same origin by a corner point.
+    # Open3D's grid starts half a voxel below the minimum: give it the same origin by a corner
+    # point.
     corner = np.floor(points.min(0) / 0.01) * 0.01 + 0.005
     points = np.concatenate((points, corner[None]))
     points = points[(points >= corner - 1e-12).all(1)]

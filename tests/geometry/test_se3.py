@@ -30,7 +30,9 @@ def test_quaternion_and_log_match_scipy(rotations: torch.Tensor) -> None:
     np.testing.assert_allclose(se3.so3_log(rotations).numpy(), expected, atol=1e-9)
     quaternion = Rotation.from_matrix(rotations.numpy()).as_quat(scalar_first=True)
     np.testing.assert_allclose(
-        se3.quaternion_to_matrix(torch.from_numpy(quaternion)).numpy(), rotations.numpy(), atol=1e-12
+        se3.quaternion_to_matrix(torch.from_numpy(quaternion)).numpy(),
+        rotations.numpy(),
+        atol=1e-12,
     )
 
 
@@ -39,7 +41,9 @@ def test_log_inverts_exp(angle: float) -> None:
     axis = torch.nn.functional.normalize(
         torch.randn(50, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64), dim=-1
     )
-    torch.testing.assert_close(se3.so3_log(se3.so3_exp(axis * angle)), axis * angle, atol=1e-8, rtol=0)
+    torch.testing.assert_close(
+        se3.so3_log(se3.so3_exp(axis * angle)), axis * angle, atol=1e-8, rtol=0
+    )
 
 
 def test_geodesic_angle_of_known_turns() -> None:

@@ -1,6 +1,7 @@
 """The `iga` aligner: learned dense correspondence and consistency voting (variant `factorised`).
 
-Everything is invariant under separate rigid motions of the test clouds and of each demonstration, up to
+Everything is invariant under separate rigid motions of the test clouds and of each demonstration,
+up to
 the choice of nodes, which furthest point sampling makes from the clouds' own geometry.
 """
 
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from iga_drake.aligners.iga.descriptor import DescriptorNet
 from iga_drake.aligners.iga.voting import Match, VotingConfig, match_object, vote
-from iga_drake.aligners.protocol import Alignment, AlignerError, PoseEstimate, check_cloud
+from iga_drake.aligners.protocol import AlignerError, Alignment, PoseEstimate, check_cloud
 from iga_drake.geometry.clouds import furthest_point_sampling
 from iga_drake.paths import models_dir
 

@@ -1,9 +1,12 @@
 """SE(3)-invariant dense descriptors of a point cloud, with whole-object context.
 
-Every node carries invariant scalars and equivariant vectors (Vector Neurons, Deng et al. 2021). Layers
+Every node carries invariant scalars and equivariant vectors (Vector Neurons, Deng et al. 2021).
+Layers
 attend over all nodes of the object with invariant pair features only, and pass equivariant
-messages. Cross and triple products make the features sensitive to handedness: without them the left and
-the right side of a mirror-symmetric object would look the same. The result is exactly invariant under
+messages. Cross and triple products make the features sensitive to handedness: without them the
+left and
+the right side of a mirror-symmetric object would look the same. The result is exactly invariant
+under
 rotations and translations, and independent of the order of the points for given nodes.
 """
 
@@ -44,10 +47,14 @@ class VectorLinear(nn.Module):
 class LocalMoments(nn.Module):
     """Encodes the surroundings of each node by moments over radial shells of the dense cloud.
 
-    Per shell: how full it is, the mean offset (a vector) and the second moment (a symmetric matrix).
-    Learned mixtures of the vectors, also after multiplication by the second moments, are equivariant;
+    Per shell: how full it is, the mean offset (a vector) and the second moment (a symmetric
+    matrix).
+    Learned mixtures of the vectors, also after multiplication by the second moments, are
+    equivariant;
     their inner and triple products are invariant. Costs two matrix products, no neighbour search.
     """
+
+    radii: Tensor
 
     def __init__(self, config: DescriptorConfig):
         super().__init__()
@@ -126,7 +133,9 @@ class ContextLayer(nn.Module):
         self.out = nn.Linear(d, d)
         self.triple = VectorLinear(c, 3 * c)
         self.norm2 = nn.LayerNorm(d + 4 * c)
-        self.mlp = nn.Sequential(nn.Linear(d + 4 * c, 2 * d), nn.GELU(), nn.Linear(2 * d, d + 2 * c))
+        self.mlp = nn.Sequential(
+            nn.Linear(d + 4 * c, 2 * d), nn.GELU(), nn.Linear(2 * d, d + 2 * c)
+        )
         self.vector_out = VectorLinear(c + h, c)
         self.self_mix = VectorLinear(2 * c, c)
 
@@ -162,8 +171,10 @@ class ContextLayer(nn.Module):
         update, gates = self.mlp(self.norm2(torch.cat((s, invariants), -1))).split((d, 2 * c), -1)
         s = s + update
         g1, g2 = gates[:, :, None].chunk(2, -1)
-        v = v + torch.sigmoid(g1) * message + torch.tanh(g2) * self.self_mix(
-            torch.cat((message, cross), -1)
+        v = (
+            v
+            + torch.sigmoid(g1) * message
+            + torch.tanh(g2) * self.self_mix(torch.cat((message, cross), -1))
         )
         norm = v.square().sum(-2, keepdim=True).mean(-1, keepdim=True).add(1e-6).sqrt()
         return s, v / norm.clamp_min(1.0)

@@ -1,9 +1,12 @@
 """Consistency voting: closed-form proposals of the alignment from dense soft matches.
 
-Per demonstration and object the descriptors' match logits are turned into a few *global hypotheses*, coarse
+Per demonstration and object the descriptors' match logits are turned into a few *global
+hypotheses*, coarse
 motions that are each consistent with themselves (a symmetric object has several). Under every
-hypothesis, the neighbourhood of each test node is carried rigidly onto its matched points. A pair of
-parts (i of A, j of B) then proposes `X_B^-1 X_A` once per demonstration; pairs whose proposals agree over
+hypothesis, the neighbourhood of each test node is carried rigidly onto its matched points. A pair
+of
+parts (i of A, j of B) then proposes `X_B^-1 X_A` once per demonstration; pairs whose proposals
+agree over
 the demonstrations are what the task is about.
 """
 
@@ -39,6 +42,8 @@ class VotingConfig:
     distinct: float = 0.5
     # A hypothesis is kept when its mean log-likelihood is this close to the best one's.
     margin: float = 0.12
+    # Weight of that difference in the vote: how many nodes count as independent evidence.
+    evidence: float = 0.0
     # Parts of the test objects that vote, and the share of the nodes in a part.
     parts: int = 32
     neighbourhood: float = 0.2
@@ -93,7 +98,8 @@ def global_hypotheses(
 ) -> tuple[Tensor, Tensor]:
     """Coarse motions (H, 4, 4) of unit-scaled test nodes x (M, 3) onto y (N, 3), best first.
 
-    Triplets of matches drawn from the soft matching, fitted (Kabsch), scored by the likelihood of all
+    Triplets of matches drawn from the soft matching, fitted (Kabsch), scored by the likelihood of
+    all
     nodes under descriptors and geometry, refined by expectation maximisation.
     """
     M = len(x)
@@ -156,14 +162,13 @@ def match_object(
     return Match(score, fit, transform(fit, test[:parts, None])[..., 0, :], residual)
 
 
-def _pose_distance2(
-    Ra: Tensor, pa: Tensor, Rb: Tensor, pb: Tensor, config: VotingConfig
-) -> Tensor:
-    """Squared distance of poses; rotations (..., 3, 3) by the chord, places (..., 3) at the part."""
+def _pose_distance2(Ra: Tensor, pa: Tensor, Rb: Tensor, pb: Tensor, config: VotingConfig) -> Tensor:
+    """Squared distance of poses; rotations (..., 3, 3) by the chord, places (..., 3) at the
+    part."""
     chord2 = (3 - (Ra * Rb).sum((-1, -2))).clamp_min(0)  # = 4 sin^2(angle / 2), about angle^2
-    return chord2 / config.sigma_rotation**2 + (pa - pb).square().sum(
-        -1
-    ) / config.sigma_translation**2
+    return (
+        chord2 / config.sigma_rotation**2 + (pa - pb).square().sum(-1) / config.sigma_translation**2
+    )
 
 
 def _combine(A: list[Match], B: list[Match], config: VotingConfig) -> tuple[Tensor, Tensor, Tensor]:
@@ -183,18 +188,23 @@ def _combine(A: list[Match], B: list[Match], config: VotingConfig) -> tuple[Tens
             (a.residual[i] / config.residual).square()[:, :, None]
             + (b.residual[j] / config.residual).square()[:, None]
         )
+        quality = quality + config.evidence * log_prior[best][:, None, None]
         padding = config.combinations - count
         if padding:
             X = torch.cat((X, X[:1].expand(padding, -1, -1, -1, -1)))
             gap = torch.cat((gap, gap[:1].expand(padding, -1, -1)))
-            quality = torch.cat((quality, torch.full_like(quality[:1], -1e3).expand(padding, -1, -1)))
+            quality = torch.cat(
+                (quality, torch.full_like(quality[:1], -1e3).expand(padding, -1, -1))
+            )
         poses.append(X)
         weights.append(quality)
         gaps.append(gap)
     return torch.stack(poses), torch.stack(weights), torch.stack(gaps)
 
 
-def vote(A: list[Match], B: list[Match], test_A: Tensor, config: VotingConfig) -> tuple[Tensor, Tensor]:
+def vote(
+    A: list[Match], B: list[Match], test_A: Tensor, config: VotingConfig
+) -> tuple[Tensor, Tensor]:
     """Modes X (K, 4, 4) best first and their energies (K,) = -log(support).
 
     A, B: the matches of both objects, one per demonstration; test_A (P, 3) the voting parts of A.
@@ -215,9 +225,10 @@ def vote(A: list[Match], B: list[Match], test_A: Tensor, config: VotingConfig) -
     R = X[..., :3, :3]
     place = transform(X, part[:, None, None].expand(-1, X.shape[1], 1, 3))[..., 0, :]
     chord2 = (3 - R.flatten(2) @ R.flatten(2).transpose(1, 2)).clamp_min(0)
-    distance2 = chord2 / config.sigma_rotation**2 + (
-        torch.cdist(place, place) / config.sigma_translation
-    ).square()
+    distance2 = (
+        chord2 / config.sigma_rotation**2
+        + (torch.cdist(place, place) / config.sigma_translation).square()
+    )
     K = len(X)
     kernel = (-0.5 * distance2).exp().reshape(K, D * C, D, C)
     kernel = kernel * log_w.exp()[:, None]
@@ -229,25 +240,31 @@ def vote(A: list[Match], B: list[Match], test_A: Tensor, config: VotingConfig) -
     weight = total.flatten()[top]
     # A candidate becomes the mean of the proposals that support it, one per demonstration.
     members = X[k].reshape(len(k), D, C, 4, 4)
-    members = torch.gather(
-        members, 2, which[k, c][:, :, None, None, None].expand(-1, -1, 1, 4, 4)
-    )[:, :, 0]
+    members = torch.gather(members, 2, which[k, c][:, :, None, None, None].expand(-1, -1, 1, 4, 4))[
+        :, :, 0
+    ]
     share = best[k, c] + 1e-6
     share = share / share.sum(-1, keepdim=True)
     rotation = nearest_rotation((share[..., None, None] * members[..., :3, :3]).sum(1))
     at = part[k]
-    moved = (share[..., None] * transform(members, at[:, None, None].expand(-1, D, 1, 3))[:, :, 0]).sum(1)
+    moved = (
+        share[..., None] * transform(members, at[:, None, None].expand(-1, D, 1, 3))[:, :, 0]
+    ).sum(1)
     candidates = rigid(rotation, moved - (rotation @ at[..., None])[..., 0])
     return _modes(candidates, weight, at.mean(0), config)
 
 
-def _modes(X: Tensor, log_weight: Tensor, centre: Tensor, config: VotingConfig) -> tuple[Tensor, Tensor]:
-    """Clusters weighted poses: kernel density, mean shift from the densest, non-maximum suppression."""
+def _modes(
+    X: Tensor, log_weight: Tensor, centre: Tensor, config: VotingConfig
+) -> tuple[Tensor, Tensor]:
+    """Clusters weighted poses: kernel density, mean shift from the densest, non-maximum
+    suppression."""
     R = X[:, :3, :3]
     place = transform(X, centre[None].expand(len(X), 1, 3))[:, 0]
     weight = (log_weight - log_weight.max()).exp()
     alive = torch.ones(len(X), dtype=torch.bool)
-    poses, energies = [], []
+    poses: list[Tensor] = []
+    energies: list[float] = []
     chord2 = (3 - R.flatten(1) @ R.flatten(1).T).clamp_min(0) / config.sigma_rotation**2
     distance2 = chord2 + (torch.cdist(place, place) / config.sigma_translation).square()
     density = (-0.5 * distance2).exp() @ weight

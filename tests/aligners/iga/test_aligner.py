@@ -1,10 +1,11 @@
-"""The landed aligner: equivariant, deterministic, better than ICP, at home with one demonstration."""
+"""The landed aligner: equivariant, deterministic, better than ICP, at home with one
+demonstration."""
 
 import numpy as np
 import pytest
 
-from iga_drake.aligners.iga.aligner import IgaAligner
 from iga_drake.aligners.icp import IcpAligner
+from iga_drake.aligners.iga.aligner import IgaAligner
 from iga_drake.aligners.protocol import Alignment
 from iga_drake.dataset.samples import make_sample
 from iga_drake.evaluation.alignment import evaluate_alignment, pose_errors, random_pose
@@ -51,7 +52,9 @@ def test_moving_the_clouds_moves_the_answer(aligner: IgaAligner, count: int) -> 
 def test_estimates_are_proper_poses_with_probabilities(aligner: IgaAligner) -> None:
     estimate = aligner.align(*_problem(4), seed=0)
     R = estimate.poses[:, :3, :3]
-    np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-9
+    )
     assert (np.linalg.det(R) > 0).all()
     assert (np.diff(estimate.energies) >= 0).all()
     assert estimate.probabilities.sum() == pytest.approx(1)

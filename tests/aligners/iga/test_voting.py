@@ -49,7 +49,8 @@ def test_undeformed_objects_are_put_exactly(demonstrations: int) -> None:
 
 
 def test_deformed_objects_with_true_matches_reach_the_papers_level() -> None:
-    """Median over samples with strong deformation; the bound is loose: measured about 1.3 cm, 7 deg."""
+    """Median over samples with strong deformation; the bound is loose: measured about 1.3 cm, 7
+    deg."""
     errors = []
     for index in range(8):
         sample = make_sample("validation", index)
