@@ -182,9 +182,40 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     tasks.add_argument("--processes", type=int, default=1, help="episodes at a time")
     tasks.add_argument("--results", type=Path, help="results file to append to and to go on from")
     tasks.add_argument("--json", action="store_true", help="print the summary as JSON")
+    alignment = kinds.add_parser("alignment", help="pose error on generated samples")
+    alignment.add_argument("--aligner", type=_names, default=["iga", "icp"])
+    alignment.add_argument("--splits", type=_names, default=["validation", "unseen_categories"])
+    alignment.add_argument("--count", type=int, default=100, help="samples of each split")
+    alignment.add_argument("--weights", type=Path, help="weights of iga (default: the landed ones)")
+    alignment.add_argument("--json", action="store_true", help="print the errors as JSON")
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
+    if arguments.kind == "alignment":
+        return _evaluate_alignment(arguments)
+    return _evaluate_tasks(arguments)
+
+
+def _evaluate_alignment(arguments: argparse.Namespace) -> int:
+    from iga_drake.aligners.registry import make_aligner
+    from iga_drake.evaluation.alignment import HEADER, evaluate_alignment
+
+    rows = []
+    if not arguments.json:
+        print(HEADER)
+    for name in arguments.aligner:
+        options = {"weights": arguments.weights} if name == "iga" else {}
+        aligner = make_aligner(name, **options)
+        for split in arguments.splits:
+            rows.append(evaluate_alignment(aligner, split, arguments.count))
+            if not arguments.json:
+                print(rows[-1].row(), flush=True)
+    if arguments.json:
+        print(json.dumps([asdict(row) for row in rows], indent=2))
+    return SUCCESS
+
+
+def _evaluate_tasks(arguments: argparse.Namespace) -> int:
     from iga_drake.evaluation.task_success import Trial, evaluate, format_table, summarise
     from iga_drake.station.scenario import load_scenario
 
@@ -270,7 +301,7 @@ COMMANDS: dict[str, tuple[str, Callable[[Any], None], Callable[[Any], int]]] = {
         _demonstrate,
     ),
     "view": ("look at demonstrations", _add_view, _view),
-    "evaluate": ("success rates of whole tasks", _add_evaluate, _evaluate),
+    "evaluate": ("success of whole tasks, errors of alignments", _add_evaluate, _evaluate),
     "benchmark": ("time a part", _add_benchmark, _benchmark),
     "train": ("train the learned aligner", _add_train, _train),
 }

@@ -6,7 +6,7 @@ of the grasped cloud ends from where it belongs; rotation error: geodesic angle.
 """
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -75,6 +75,8 @@ def evaluate_alignment(aligner: Aligner, split: str, count: int) -> AlignmentErr
     """Aligns the first `count` samples of a split. Same samples and starts for every aligner."""
     if split not in SPLITS:
         raise IgaDrakeError(f"split '{split}' is not known; one of: {', '.join(SPLITS)}")
+    if count < 1:
+        raise IgaDrakeError(f"count {count}: at least 1 sample is needed")
     rows, seconds = [], []
     for index in range(count):
         sample = make_sample(split, index)
@@ -100,8 +102,3 @@ def evaluate_alignment(aligner: Aligner, split: str, count: int) -> AlignmentErr
         success=tuple(float(((cm <= 100 * m) & (deg <= d)).mean()) for m, d in THRESHOLDS),
         seconds_median=float(np.median(seconds)),
     )
-
-
-def as_json(errors: AlignmentErrors) -> dict:
-    """For a model card or a script."""
-    return asdict(errors)
