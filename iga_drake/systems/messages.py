@@ -24,6 +24,9 @@ class EndEffectorTarget:
     speed_scale: float = 1.0
     # Joint angles (rad) towards which the controller's null space is pulled.
     nominal_posture: np.ndarray | None = None
+    # Change of the external force on the hand (N) since the motion began at which it ends where the
+    # hand is, as reached; None goes on to the pose whatever is touched.
+    contact_force: float | None = None
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,8 @@ class FollowerStatus:
     # Distance left to the present target (m, rad), measured end effector against target.
     position_error: float = 0.0
     rotation_error: float = 0.0
+    # Whether contact ended the motion to the present target, maybe short of its pose.
+    touched: bool = False
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from iga_drake.systems.policy_sequence import (
     check_observation,
     choose_reachable,
     motion_steps,
+    moved_steps,
 )
 
 
@@ -287,7 +288,8 @@ class PolicyMachine:
         status = memory.status
         if status.step != step.name:
             memory = replace(memory, status=replace(status, step=step.name))
-        if inputs.follower().sequence_reached < step.target.sequence:
+        follower = inputs.follower()
+        if follower.sequence_reached < step.target.sequence:
             return self._check_time(memory, inputs, now, self.config.execute_limit)
         if step.waypoint is not None:
             reached = (*memory.status.waypoints_reached, inputs.pose())
@@ -295,9 +297,13 @@ class PolicyMachine:
         index = memory.step + 1
         if index == len(memory.steps):
             return self._enter(memory, Phase.DONE, now)
-        following = memory.steps[index]
+        steps = memory.steps
+        if follower.touched:
+            steps = moved_steps(steps, step.target.X_WE, inputs.pose())
+        following = steps[index]
         return replace(
             memory,
+            steps=steps,
             step=index,
             target=following.target,
             status=replace(memory.status, step=following.name),

@@ -4,7 +4,7 @@ Everything here is a plain function or a frozen value, so that it can be tested 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Literal
 
@@ -90,6 +90,9 @@ class TaskMotion:
     opening_reached: float
     # Time (s) given to the hand at the waypoint.
     settle: float = 1.0
+    # Change of the external force on the hand (N) at which the way from before the waypoint to it
+    # ends early: the hand acts where it is then. None: it ends at the waypoint alone.
+    contact_force: float | None = None
     # Offset (m) of the pose after the waypoint.
     after_E: tuple[float, float, float] = (0.0, 0.0, 0.0)
     after_W: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -103,6 +106,10 @@ class TaskMotion:
             raise PolicyError("TaskMotion.present: None found, a pose expected (observes_grasped)")
         if not self.symmetries_E:
             raise PolicyError("TaskMotion.symmetries_E: empty, the identity at least expected")
+        if self.contact_force is not None and not self.contact_force > 0:
+            raise PolicyError(
+                f"TaskMotion.contact_force: {self.contact_force} N found, it has to be > 0"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,10 +159,21 @@ def motion_steps(
                 settle=settle,
                 speed_scale=speed,
                 nominal_posture=nominal_posture,
+                contact_force=None if noted is None else motion.contact_force,
             ),
             waypoint=noted,
         )
         for index, (name, pose, moving, reached, settle, speed, noted) in enumerate(plan)
+    )
+
+
+def moved_steps(
+    steps: Sequence[MotionStep], X_WE: RigidTransform, X_WE_reached: RigidTransform
+) -> tuple[MotionStep, ...]:
+    """`steps` planned around `X_WE`, moved rigidly to where the hand got instead."""
+    X_WW = X_WE_reached @ X_WE.inverse()
+    return tuple(
+        replace(step, target=replace(step.target, X_WE=X_WW @ step.target.X_WE)) for step in steps
     )
 
 

@@ -52,6 +52,8 @@ class _Motion:
     progress_rate: float = 0.0  # 1/s
     opening: float | None = None  # m
     time_reached: float | None = None  # s
+    force_start: np.ndarray | None = None  # N, where the target has a contact force
+    touched: bool = False
     status: FollowerStatus = field(default_factory=FollowerStatus)
 
     def __deepcopy__(self, memo: dict) -> "_Motion":
@@ -69,6 +71,7 @@ class WaypointFollower(LeafSystem):
         - target
         - pose_measured
         - position_measured (optional)
+        - force_measured (optional)
         output_ports:
         - desired_pose
         - hand.opening
@@ -81,6 +84,9 @@ class WaypointFollower(LeafSystem):
     - `pose_measured` (RigidTransform): X_WE.
     - `position_measured` (N, rad): the arm's joints. If it is connected and a `solver` was given,
       a straight line that the arm can't follow is replaced by a path through the joints.
+    - `force_measured` (3, N in W): external force on the hand. Targets with a `contact_force` need
+      it: once it has changed by that much since the motion began, the desired pose stays at the
+      measured one and the target counts as reached.
     - `desired_pose` (RigidTransform): X_WE now. Before the first target, the pose first measured.
     - `hand.opening` (1, m): `opening_moving` on the way, `opening_reached` after it. Before the
       first target, `initial_opening`.
@@ -109,6 +115,7 @@ class WaypointFollower(LeafSystem):
         self._target_input = self.DeclareAbstractInputPort("target", Value[object]())
         self._pose_input = self.DeclareAbstractInputPort("pose_measured", Value(RigidTransform()))
         self._position_input = self.DeclareVectorInputPort("position_measured", len(self._home))
+        self._force_input = self.DeclareVectorInputPort("force_measured", 3)
         self._solver = solver
         self._motion = self.DeclareAbstractState(Value[object](_Motion()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(self._config.time_step, 0.0, self._update)
@@ -140,6 +147,8 @@ class WaypointFollower(LeafSystem):
             motion.target is None or target.sequence != motion.target.sequence
         ):
             motion = self._start(context, motion, self._check(target), desired, X_WE)
+        if self._meets_contact(context, motion):
+            motion = replace(motion, touched=True, time_reached=context.get_time(), X_WDesired=X_WE)
         if motion.target is None:
             motion = replace(motion, X_WDesired=desired)
         else:
@@ -176,7 +185,28 @@ class WaypointFollower(LeafSystem):
             progress=0.0,
             progress_rate=0.0,
             time_reached=None,
+            force_start=self._read_force(context, target),
+            touched=False,
         )
+
+    def _read_force(self, context: Context, target: EndEffectorTarget) -> np.ndarray | None:
+        """The external force (N) where the target asks for it; nothing is computed elsewhere."""
+        if target.contact_force is None:
+            return None
+        if not self._force_input.HasValue(context):
+            raise IgaDrakeError(
+                f"target {target.sequence}: contact_force {target.contact_force} N needs the input "
+                "port force_measured: connect it"
+            )
+        return self._force_input.Eval(context).copy()
+
+    def _meets_contact(self, context: Context, motion: _Motion) -> bool:
+        """Whether the motion under way has just touched something."""
+        target = motion.target
+        if target is None or target.contact_force is None or motion.time_reached is not None:
+            return False
+        change = self._force_input.Eval(context) - motion.force_start
+        return float(np.linalg.norm(change)) > target.contact_force
 
     def _check(self, target: EndEffectorTarget) -> EndEffectorTarget:
         """Refuses a target that can't be followed."""
@@ -185,6 +215,10 @@ class WaypointFollower(LeafSystem):
         if not 0.0 < target.speed_scale <= 1.0:
             raise IgaDrakeError(
                 f"target {target.sequence}: speed_scale {target.speed_scale} is outside (0, 1]"
+            )
+        if target.contact_force is not None and not target.contact_force > 0:
+            raise IgaDrakeError(
+                f"target {target.sequence}: contact_force {target.contact_force} N has to be > 0"
             )
         posture = target.nominal_posture
         if posture is not None and (
@@ -202,7 +236,9 @@ class WaypointFollower(LeafSystem):
         assert target is not None and path is not None
         duration = motion.duration
         progress, rate = motion.progress, motion.progress_rate
-        if duration > 0 and progress < 1.0:
+        if motion.touched:
+            rate = 0.0
+        elif duration > 0 and progress < 1.0:
             # Trapezoid in the share of the way: the rate rises by `acceleration`, and falls again
             # so as to be zero at the end.
             cruise = 1.0 / duration
@@ -229,9 +265,10 @@ class WaypointFollower(LeafSystem):
         if time_reached is not None and time >= time_reached + target.settle - 1e-9:
             finished = target.sequence
         posture = path.posture(progress)
+        desired = path.pose(progress) if progress < 1.0 else target.X_WE
         return replace(
             motion,
-            X_WDesired=path.pose(progress) if progress < 1.0 else target.X_WE,
+            X_WDesired=motion.X_WDesired if motion.touched else desired,
             posture=motion.posture if posture is None else posture,
             progress=progress,
             progress_rate=rate,
@@ -241,6 +278,7 @@ class WaypointFollower(LeafSystem):
                 sequence_reached=finished,
                 position_error=position_error,
                 rotation_error=rotation_error,
+                touched=motion.touched,
             ),
         )
 

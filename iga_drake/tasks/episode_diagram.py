@@ -16,6 +16,7 @@ from iga_drake.station.scenario import Scenario
 from iga_drake.station.scene import Scene
 from iga_drake.station.simulation import build_simulation_station
 from iga_drake.systems.differential_ik import DifferentialIk, DifferentialIkConfig
+from iga_drake.systems.external_force import ExternalForce
 from iga_drake.systems.forward_kinematics import ForwardKinematics
 from iga_drake.systems.fusion import PointCloudFusion
 from iga_drake.systems.iga_policy import IgaPolicy
@@ -78,6 +79,7 @@ def build_episode_diagram(
     robot = make_panda_planning_robot()
     control = scenario.control
     kinematics = builder.AddNamedSystem("forward_kinematics", ForwardKinematics(robot))
+    force = builder.AddNamedSystem("external_force", ExternalForce(robot))
     solver = PoseSolver(robot)
     opening = scene.hand_opening if scene.hand_command is None else scene.hand_command
     follower = builder.AddNamedSystem(
@@ -140,6 +142,9 @@ def build_episode_diagram(
     connect(policy, "target", follower, "target")
     connect(kinematics, "pose", follower, "pose_measured")
     connect(station, "panda.position_measured", follower, "position_measured")
+    connect(station, "panda.position_measured", force, "position")
+    connect(station, "panda.torque_external", force, "torque_external")
+    connect(force, "force", follower, "force_measured")
     connect(follower, "desired_pose", ik, "desired_pose")
     connect(follower, "nominal_posture", ik, "nominal_posture")
     connect(ik, "position", supervisor, "position_commanded")

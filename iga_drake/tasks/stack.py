@@ -35,6 +35,7 @@ OFFSET_SHARE = 0.25  # of the target's diameter, between the axes at the held bo
 DEPTH_SHARE = 0.3  # of the target's height, of the held bowl's base below the target's rim
 REST = 0.003  # m moved in the last half second
 MAXIMUM_DROP = 0.02  # m from the release to nesting, by choice of the pairs
+CONTACT_FORCE = 15.0  # N; the bowl is let go where it, or a finger, meets the other one
 RELEASE_OPENING = (
     0.03  # m; more would push the outer finger, which points down, into the bowl below
 )
@@ -146,6 +147,7 @@ class Stack(Task):
         opening_approach=0.0,
         opening_reached=RELEASE_OPENING,
         settle=1.0,
+        contact_force=CONTACT_FORCE,
         after_E=(0.0, 0.0, -0.12),
     )
 

@@ -168,6 +168,33 @@ def test_the_symmetry_near_the_present_posture_is_taken():
     assert memory.chosen.symmetry == 1
 
 
+def test_a_descent_that_touches_goes_on_from_where_it_stopped():
+    motion = replace(STACK, contact_force=15.0)
+    machine, inputs = make_machine(motion), FakeInputs()
+    stopped = RigidTransform(RollPitchYaw(np.pi, 0.02, 0.4), [0.5, 0.102, 0.07])
+    memory, now, targets = machine.start(), 0.0, {}
+    while not memory.status.phase.final and now < 100.0:
+        memory = machine.advance(memory, inputs, now)
+        sent = memory.target
+        targets[sent.sequence] = sent
+        touched = sent.contact_force is not None
+        inputs.X_WE = stopped if touched else sent.X_WE
+        inputs.follower_status = FollowerStatus(sequence_reached=sent.sequence, touched=touched)
+        now += machine.config.period
+    assert memory.status.phase is Phase.DONE
+    assert [targets[k].contact_force for k in range(1, 6)] == [None, None, 15.0, None, None]
+    assert targets[3].X_WE.IsNearlyEqualTo(X_GOAL, 1e-12)
+    assert targets[4].X_WE.IsNearlyEqualTo(stopped, 1e-12)  # the hand opens where it is
+    retreat = stopped.inverse() @ targets[5].X_WE
+    assert retreat.IsNearlyEqualTo(RigidTransform([0, 0, -0.1]), 1e-9)
+    assert memory.status.waypoints_reached[0].IsNearlyEqualTo(stopped, 1e-12)
+
+
+def test_a_contact_force_is_positive():
+    with pytest.raises(PolicyError, match=r"contact_force: 0\.0 N found"):
+        replace(STACK, contact_force=0.0)
+
+
 def test_a_motion_that_never_arrives_fails_with_what_is_left_and_holds_where_it_is():
     inputs = FakeInputs(follower_status=FollowerStatus(0, 0.123, 0.1))
     memory, _ = run(make_machine(execute_limit=5.0), inputs, reach=False)

@@ -36,6 +36,9 @@ class Run:
     def measure(self, X_WE):
         self.system.GetInputPort("pose_measured").FixValue(self.context, X_WE)
 
+    def push(self, force):
+        self.system.GetInputPort("force_measured").FixValue(self.context, force)
+
     def send(self, target):
         self.system.GetInputPort("target").FixValue(self.context, Value[object](target))
 
@@ -163,6 +166,42 @@ def test_posture_of_a_target_is_passed_on():
     np.testing.assert_allclose(run.get("nominal_posture"), posture)
 
 
+def test_contact_ends_a_motion_that_asks_for_it():
+    run = Run(linear_speed=0.25)
+    weight = np.array([0.0, 0.0, -8.0])  # of what is held: more than the contact force
+    run.push(weight)
+    guarded = {"contact_force": 6.0, "settle": 0.2, "opening_moving": 0.0, "opening_reached": 0.03}
+    run.send(target(downward(0.5, 0.0, 0.2), **guarded))
+    run.step(60)
+    run.push(weight + [0.0, 3.0, 4.0])
+    free = run.step()[-1]
+    assert 0.21 < free.translation()[2] < 0.29
+    run.push(weight + [0.0, 3.0, 5.5])
+    for X_WE in run.step(20):
+        assert X_WE.IsNearlyEqualTo(free, 1e-12)
+    assert run.get("hand.opening") == pytest.approx(0.03)
+    assert run.get("status").sequence_reached == 0
+    run.push(weight)  # it comes off again, but stays there
+    assert run.step(30)[-1].IsNearlyEqualTo(free, 1e-12)
+    status = run.get("status")
+    assert status.sequence_reached == 1 and status.touched
+    assert status.position_error == pytest.approx(free.translation()[2] - 0.2)
+    # The next target moves on from there and knows nothing of it.
+    run.push(10 * weight)
+    run.send(target(downward(0.5, 0.0, 0.3), sequence=2))
+    assert pose_error(free, run.step()[-1])[0] < 0.0015
+    run.step(200)
+    assert run.get("status").sequence_reached == 2 and not run.get("status").touched
+
+
+def test_a_guarded_motion_without_contact_gets_to_its_pose():
+    run = Run()
+    run.push(np.array([0.0, 0.0, -3.0]))
+    run.send(target(downward(0.5, 0.0, 0.2), contact_force=6.0))
+    assert run.step(300)[-1].IsNearlyEqualTo(downward(0.5, 0.0, 0.2), 1e-9)
+    assert run.get("status").sequence_reached == 1 and not run.get("status").touched
+
+
 def test_with_a_solver_it_goes_around_the_base():
     run = Run(solver=panda_solver())
     home = panda_robot().home
@@ -185,6 +224,8 @@ def test_with_a_solver_it_goes_around_the_base():
         (target(RigidTransform([np.nan, 0, 0])), "finite"),
         (target(X_START, speed_scale=0.0), "speed_scale"),
         (target(X_START, nominal_posture=np.zeros(6)), "nominal_posture"),
+        (target(X_START, contact_force=0.0), "contact_force 0.0 N has to be"),
+        (target(X_START, contact_force=5.0), "needs the input port force_measured"),
     ],
 )
 def test_bad_targets_are_refused(bad, message):
