@@ -1,4 +1,4 @@
-"""Where the repository's data folders lie, in a checkout and in an installed wheel."""
+"""Where the repository's data folders lie, in an installed wheel and in a checkout."""
 
 import os
 from pathlib import Path
@@ -8,11 +8,12 @@ from iga_drake.errors import IgaDrakeError
 
 def _data_dir(name: str) -> Path:
     package = Path(__file__).resolve().parent
-    for candidate in (package.parent / name, package / "_data" / name):
+    # A wheel's own folder first: beside an installed package may lie somebody else's `models`.
+    for candidate in (package / "_data" / name, package.parent / name):
         if candidate.is_dir():
             return candidate
     raise IgaDrakeError(
-        f"folder '{name}' not found beside or inside {package}: reinstall the package or run from "
+        f"folder '{name}' not found inside or beside {package}: reinstall the package or run from "
         "a checkout"
     )
 
