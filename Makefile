@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 # The CPU build that this release was tested with; a newer Python gets the newest torch.
 TORCH ?= torch==2.13.0
-EXTRAS := icp,visuals,train,notebook,dev
+EXTRAS := icp,visuals,notebook,dev
 PACKAGES := libusb-1.0-0 libgl1 libegl1 libgl1-mesa-dri libgomp1 python3-venv
 
 .PHONY: demo test check setup clean
