@@ -194,8 +194,6 @@ class Task:
 
     # Name in the task registry of `iga_drake.tasks`.
     name: str = "grasp"
-    # What that task lets one choose, as numbers or text; it refuses names it doesn't know.
-    options: dict[str, float | str] = field(default_factory=dict)
     # Simulated time after which the episode has failed (s), > 0.
     time_limit: float = 120.0
 
@@ -240,7 +238,10 @@ class PhaseTimeLimits:
 
 @dataclass
 class Seeds:
-    """Added to the episode's seed, so that one source of chance varies and the others stay."""
+    """Added to the episode's seed, so that one source of chance varies and the others stay.
+
+    Each >= 0.
+    """
 
     # Objects and their poses.
     scene: int = 0
@@ -264,7 +265,7 @@ class Scenario:
     visualization: Visualization = field(default_factory=Visualization)
     task: Task = field(default_factory=Task)
     aligner: Aligner = field(default_factory=Aligner)
-    # File or folder with the demonstrations; a relative path starts at `models/`.
+    # Folder with the demonstrations; a relative path starts at `models/`.
     demonstrations: str = "demonstrations/grasp"
     control: Control = field(default_factory=Control)
     time_limits: PhaseTimeLimits = field(default_factory=PhaseTimeLimits)
@@ -456,3 +457,5 @@ def _check_values(s: Scenario) -> None:
     scale = s.control.joint_speed_scale
     need(scale <= 1, "control.joint_speed_scale", scale, "0..1")
     positive(s.time_limits, "time_limits", *vars(s.time_limits))
+    for name, seed in vars(s.seeds).items():
+        need(seed >= 0, f"seeds.{name}", seed, ">= 0")

@@ -96,7 +96,8 @@ def test_what_is_stated_is_taken_and_the_rest_stays(tmp_path):
         """
         plant: {time_step: 0.001}
         control: {period: 1e-2, linear_speed: 1}
-        task: {name: stack, options: {count: 3, color: red}}
+        task: {name: stack}
+        aligner: {options: {count: 3, color: red}}
         cameras: {left: {noise: {gaussian: false}}}
         """,
     )
@@ -104,7 +105,7 @@ def test_what_is_stated_is_taken_and_the_rest_stays(tmp_path):
     assert scenario.plant.discrete_contact_approximation == "sap"
     assert scenario.control.period == 0.01
     assert scenario.control.linear_speed == 1.0
-    assert scenario.task.options == {"count": 3.0, "color": "red"}
+    assert scenario.aligner.options == {"count": 3.0, "color": "red"}
     assert scenario.camera_names == ("left",)
     assert not scenario.cameras["left"].noise.gaussian
     assert scenario.cameras["left"].noise.dropouts
@@ -114,6 +115,7 @@ def test_what_is_stated_is_taken_and_the_rest_stays(tmp_path):
 @pytest.mark.parametrize(
     ("text", "key", "valid"),
     [
+        ("task: {options: {}}", "options", ("name", "time_limit")),
         ("nonsense: 1", "nonsense", ("plant", "cameras", "task", "seeds")),
         ("plant: {time_stp: 0.1}", "time_stp", ("time_step", "contact_model")),
         ("cameras: {a: {nose: {}}}", "nose", ("pose", "intrinsics", "noise", "calibration")),
@@ -142,7 +144,7 @@ def test_unknown_key_lists_the_valid_ones(tmp_path, text, key, valid):
         ("visualization: {meshcat: 1}", "visualization.meshcat"),
         ("control: {period: true}", "control.period"),
         ("control: {period: .nan}", "control.period"),
-        ("task: {options: {a: true}}", "task.options.a"),
+        ("aligner: {options: {a: true}}", "aligner.options.a"),
         ("demonstrations: 5", "demonstrations"),
         ("seeds: {scene: null}", "seeds.scene"),
     ],
@@ -170,6 +172,7 @@ def test_wrong_type_names_the_key(tmp_path, text, where):
         ("fusion: {erosion: -1}", "fusion.erosion"),
         ("control: {joint_speed_scale: 1.5}", "control.joint_speed_scale"),
         ("time_limits: {infer: 0}", "time_limits.infer"),
+        ("seeds: {scene: -1}", "seeds.scene"),
     ],
 )
 def test_value_out_of_range_names_the_key(tmp_path, text, where):
