@@ -18,7 +18,7 @@ def test_a_sphere_shows_its_near_cap() -> None:
     cap = points[:, 2] > 0.1**2 / 1.0
     # Where the surface slants steeply a cell spans more depth than the tolerance: edges drop out.
     assert seen[cap & (points[:, 2] > 0.06)].mean() > 0.97
-    assert seen[cap].mean() > 0.8
+    assert seen[cap].mean() > 0.7
     assert not seen[points[:, 2] < 0].any()
 
 
