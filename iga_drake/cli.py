@@ -50,12 +50,22 @@ def write_text(path: Path, text: str) -> None:
         partial.unlink(missing_ok=True)
 
 
+def _seed(text: str) -> int:
+    """A seed, as argparse takes it: NumPy knows none below 0."""
+    seed = int(text)
+    if seed < 0:
+        raise argparse.ArgumentTypeError(f"{seed} found, an integer >= 0 expected")
+    return seed
+
+
 # simulate
 
 
 def _add_simulate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenario", help="scenario YAML, e.g. diagrams/stack.yaml")
-    parser.add_argument("--seed", type=int, default=0, help="scene, noise and aligner (default 0)")
+    parser.add_argument(
+        "--seed", type=_seed, default=0, help="scene, noise and aligner (default 0)"
+    )
     parser.add_argument("--aligner", choices=ALIGNERS, help="default: the scenario's")
     parser.add_argument(
         "--split", choices=("test", "demonstration"), default="test", help="which object instances"
@@ -115,15 +125,16 @@ def _add_demonstrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenario", help="scenario YAML, e.g. diagrams/stack.yaml")
     parser.add_argument("--count", type=int, default=5, help="demonstrations to keep (default 5)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first attempt")
+    parser.add_argument("--seed", type=_seed, default=0, help="seed of the first attempt")
 
 
 def _demonstrate(arguments: argparse.Namespace) -> int:
-    from iga_drake.aligners.demonstration import write_demonstrations
+    from iga_drake.aligners.demonstration import check_replaceable, write_demonstrations
     from iga_drake.station.scenario import load_scenario
     from iga_drake.tasks.episode import record_demonstrations
 
     scenario = load_scenario(scenario_path(arguments.scenario))
+    check_replaceable(arguments.out)  # before minutes of recording
     demonstrations = record_demonstrations(
         scenario, count=arguments.count, first_seed=arguments.seed
     )
@@ -177,7 +188,7 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     tasks.add_argument("--tasks", type=_names, default=["grasp", "stack"], help="scenarios")
     tasks.add_argument("--trials", type=int, default=15)
     tasks.add_argument("--aligner", type=_names, default=["iga", "icp"])
-    tasks.add_argument("--seed", type=int, default=0, help="seed of the first trial")
+    tasks.add_argument("--seed", type=_seed, default=0, help="seed of the first trial")
     tasks.add_argument("--split", choices=("test", "demonstration"), default="test")
     tasks.add_argument("--processes", type=int, default=1, help="episodes at a time")
     tasks.add_argument("--results", type=Path, help="results file to append to and to go on from")
@@ -221,6 +232,9 @@ def _evaluate_tasks(arguments: argparse.Namespace) -> int:
 
     if arguments.trials < 1:
         raise CommandError(f"--trials {arguments.trials}: at least 1 is needed")
+    for option in ("tasks", "aligner"):
+        if not getattr(arguments, option):
+            raise CommandError(f"--{option}: empty, at least one name is needed")
     unknown = [name for name in arguments.aligner if name not in ALIGNERS]
     if unknown:
         raise CommandError(f"--aligner {unknown[0]}: unknown; one of: {', '.join(ALIGNERS)}")
@@ -327,6 +341,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return BAD_INPUT
     except BrokenPipeError:
         return FAILURE
+    except OSError as error:
+        if error.filename is None:
+            raise
+        print(f"iga {parsed.command}: {error.filename}: {error.strerror}", file=sys.stderr)
+        return BAD_INPUT
 
 
 if __name__ == "__main__":

@@ -88,10 +88,27 @@ def test_evaluate_refuses_what_it_does_not_know(capsys):
     assert "oracle: unknown" in refused(capsys, "evaluate", "tasks", "--aligner", "oracle")
     assert "juggle: no such file" in refused(capsys, "evaluate", "tasks", "--tasks", "juggle")
     assert "at least 1" in refused(capsys, "evaluate", "tasks", "--trials", "0")
+    assert "--tasks: empty" in refused(capsys, "evaluate", "tasks", "--tasks", ",")
+
+
+def test_a_folder_that_is_not_demonstrations_is_refused_before_recording(capsys, tmp_path: Path):
+    (tmp_path / "thesis.tex").touch()
+    line = refused(capsys, "demonstrate", "grasp", "--out", str(tmp_path))
+    assert "not overwritten" in line
+
+
+def test_a_file_where_a_folder_should_be(capsys, tmp_path: Path):
+    write_demonstrations(tmp_path / "demos", make_set())
+    (tmp_path / "file").touch()
+    page = tmp_path / "file" / "demos.html"
+    line = refused(capsys, "view", "demonstrations", str(tmp_path / "demos"), "--html", str(page))
+    assert str(tmp_path / "file") in line
 
 
 @pytest.mark.parametrize(
-    "arguments", [["simulate"], ["simulate", "grasp", "--aligner", "oracle"], ["fly"], []]
+    "arguments",
+    [["simulate"], ["simulate", "grasp", "--aligner", "oracle"], ["fly"], []]
+    + [["simulate", "grasp", "--seed", seed] for seed in ("-1", "three")],
 )
 def test_bad_usage_has_exit_status_2(arguments: list[str]):
     with pytest.raises(SystemExit) as exit_info:

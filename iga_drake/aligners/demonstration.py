@@ -160,10 +160,7 @@ def write_demonstrations(folder: Path | str, demonstrations: DemonstrationSet) -
     Raises `DemonstrationError` where `folder` exists and is not a demonstrations folder.
     """
     folder = Path(folder)
-    if folder.exists() and not (folder / MANIFEST).is_file() and _occupied(folder):
-        raise DemonstrationError(
-            f"{folder}: exists and holds no {MANIFEST}, so it is not overwritten: name a new folder"
-        )
+    check_replaceable(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     token = secrets.token_hex(4)
     partial = folder.parent / f".{folder.name}.{token}.partial"
@@ -188,7 +185,12 @@ def write_demonstrations(folder: Path | str, demonstrations: DemonstrationSet) -
         (partial / MANIFEST).write_text(text, encoding="utf-8")
         if folder.exists():
             os.rename(folder, old)
-        os.rename(partial, folder)
+        try:
+            os.rename(partial, folder)
+        except OSError:
+            if old.exists():
+                os.rename(old, folder)
+            raise
     except (TypeError, ValueError) as error:
         raise DemonstrationError(
             f"{folder}: metadata must be plain JSON values: {error}"
@@ -198,8 +200,13 @@ def write_demonstrations(folder: Path | str, demonstrations: DemonstrationSet) -
         shutil.rmtree(old, ignore_errors=True)
 
 
-def _occupied(folder: Path) -> bool:
-    return not folder.is_dir() or any(folder.iterdir())
+def check_replaceable(folder: Path) -> None:
+    """Raises `DemonstrationError` where `folder` exists and is not a demonstrations folder."""
+    occupied = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    if occupied and not (folder / MANIFEST).is_file():
+        raise DemonstrationError(
+            f"{folder}: exists and holds no {MANIFEST}, so it is not overwritten: name a new folder"
+        )
 
 
 def _write_one(path: Path, demonstration: Demonstration) -> dict[str, Any]:
@@ -306,9 +313,16 @@ def _read_one(folder: Path, where: str, entry: dict, waypoints: list[str]) -> De
             "folder again or record it again"
         ) from error
     listed = _check_type(f"{where}.arrays", entry.get("arrays"), dict)
-    expected_size = sum(
-        math.prod(array["shape"]) * np.dtype(array["dtype"]).itemsize for array in listed.values()
-    )
+    try:
+        expected_size = sum(
+            math.prod(array["shape"]) * np.dtype(array["dtype"]).itemsize
+            for array in listed.values()
+        )
+    except (KeyError, TypeError) as error:
+        raise DemonstrationError(
+            f"{where}.arrays: {listed} found, a shape and a dtype for each array expected "
+            f"({error}): copy the folder again or record it again"
+        ) from error
     found_sum = hashlib.sha256(data).hexdigest()
     if found_sum != entry.get("sha256"):
         kind = "truncated" if len(data) < expected_size else "changed"

@@ -1,4 +1,5 @@
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -134,6 +135,30 @@ def test_foreign_manifests_are_refused(folder: Path, changes: dict, message: str
     edit_manifest(folder, **changes)
     with pytest.raises(DemonstrationError, match=message):
         read_demonstrations(folder)
+
+
+@pytest.mark.parametrize("entry", [{}, 3, {"shape": [1, 3]}, {"shape": [1], "dtype": "tea"}])
+def test_an_array_without_shape_or_dtype_is_refused(folder: Path, entry):
+    manifest = json.loads((folder / MANIFEST).read_text())
+    manifest["demonstrations"][0]["arrays"]["grasped"] = entry
+    edit_manifest(folder, demonstrations=manifest["demonstrations"])
+    with pytest.raises(DemonstrationError, match=r"demonstrations\[0\].arrays"):
+        read_demonstrations(folder)
+
+
+def test_the_old_set_comes_back_where_the_new_one_cannot_take_its_place(folder: Path, monkeypatch):
+    rename = os.rename
+
+    def fail_for_the_new_one(source, target):
+        if str(source).endswith(".partial"):
+            raise OSError(28, "No space left on device", str(target))
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", fail_for_the_new_one)
+    with pytest.raises(OSError, match="No space left"):
+        write_demonstrations(folder, make_set(1))
+    assert len(read_demonstrations(folder)) == 2
+    assert [path.name for path in folder.parent.iterdir()] == ["demos"]
 
 
 def test_another_task_is_refused(folder: Path):
