@@ -198,6 +198,7 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     alignment.add_argument("--splits", type=_names, default=["validation", "unseen_categories"])
     alignment.add_argument("--count", type=int, default=100, help="samples of each split")
     alignment.add_argument("--weights", type=Path, help="weights of iga (default: the landed ones)")
+    alignment.add_argument("--card", type=Path, help="write a model card of iga's weights")
     alignment.add_argument("--json", action="store_true", help="print the errors as JSON")
 
 
@@ -208,8 +209,9 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 
 def _evaluate_alignment(arguments: argparse.Namespace) -> int:
+    from iga_drake.aligners.iga.aligner import default_weights
     from iga_drake.aligners.registry import make_aligner
-    from iga_drake.evaluation.alignment import HEADER, evaluate_alignment
+    from iga_drake.evaluation.alignment import HEADER, evaluate_alignment, model_card
 
     rows = []
     if not arguments.json:
@@ -223,6 +225,8 @@ def _evaluate_alignment(arguments: argparse.Namespace) -> int:
                 print(rows[-1].row(), flush=True)
     if arguments.json:
         print(json.dumps([asdict(row) for row in rows], indent=2))
+    if arguments.card:
+        write_text(arguments.card, model_card(arguments.weights or default_weights(), rows))
     return SUCCESS
 
 

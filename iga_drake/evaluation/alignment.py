@@ -7,9 +7,13 @@ of the grasped cloud ends from where it belongs; rotation error: geodesic angle.
 
 import time
 from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
 
 import numpy as np
 
+from iga_drake.aligners.checkpoint import load_checkpoint
+from iga_drake.aligners.iga.weights import DESCRIPTOR
 from iga_drake.aligners.protocol import Aligner, Alignment
 from iga_drake.dataset.samples import make_sample
 from iga_drake.errors import IgaDrakeError
@@ -102,3 +106,29 @@ def evaluate_alignment(aligner: Aligner, split: str, count: int) -> AlignmentErr
         success=tuple(float(((cm <= 100 * m) & (deg <= d)).mean()) for m, d in THRESHOLDS),
         seconds_median=float(np.median(seconds)),
     )
+
+
+def model_card(weights: Path, errors: list[AlignmentErrors]) -> str:
+    """Markdown: how the weights were trained (from the file itself) and their errors."""
+    _, card = load_checkpoint(weights, kind=DESCRIPTOR)
+    seed, commit = card["training"]["seed"], card.get("commit") or "unknown"
+    lines = [
+        f"# {weights.name}",
+        "",
+        f"{card['parameters']:,} parameters, {card['step']:,} steps, {card['samples_seen']:,} "
+        f"samples seen in {card['seconds'] / 60:.0f} minutes, seed {seed}, commit {commit}, "
+        f"SHA-256 {sha256(weights.read_bytes()).hexdigest()[:16]}.",
+        "",
+        "Errors: four demonstrations, the test pair's grasped cloud at a Haar-random pose; "
+        "mean ± standard deviation (median).",
+        "",
+        "```",
+        HEADER,
+        *(row.row() for row in errors),
+        "```",
+        "",
+    ]
+    for name in ("model", "training", "samples"):
+        lines.append(f"`{name}`: " + ", ".join(f"{k} {v}" for k, v in card[name].items()))
+        lines.append("")
+    return "\n".join(lines)

@@ -7,6 +7,7 @@ node and a soft target, a Gaussian in the canonical space (InfoNCE with soft pos
 
 import dataclasses
 import json
+import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -120,6 +121,15 @@ def validate(
     return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
 
 
+def _commit() -> str:
+    """The commit of the checkout that this package runs from; empty outside of one."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
 def train_descriptor(
     output: Path,
     *,
@@ -182,6 +192,7 @@ def train_descriptor(
             "samples_seen": step * config.batch,
             "seconds": seconds + time.monotonic() - began,
             "parameters": sum(p.numel() for p in net.parameters()),
+            "commit": _commit(),
         }
         save_checkpoint(output / "descriptor.safetensors", ema, kind=KIND, card=card)
         state: dict[str, Tensor] = {f"net.{n}": p for n, p in net.named_parameters()}

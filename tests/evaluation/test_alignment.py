@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from iga_drake.aligners.checkpoint import load_checkpoint
+from iga_drake.aligners.iga.aligner import default_weights
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.errors import IgaDrakeError
-from iga_drake.evaluation.alignment import evaluate_alignment, pose_errors, random_pose
+from iga_drake.evaluation.alignment import (
+    evaluate_alignment,
+    model_card,
+    pose_errors,
+    random_pose,
+)
 
 
 def test_pose_errors_of_a_known_offset() -> None:
@@ -50,3 +57,11 @@ def test_bad_arguments_are_refused() -> None:
         evaluate_alignment(_Fixed(np.eye(4)), "train", 1)
     with pytest.raises(IgaDrakeError, match="count 0"):
         evaluate_alignment(_Fixed(np.eye(4)), "validation", 0)
+
+
+def test_the_model_card_tells_what_the_file_says() -> None:
+    row = evaluate_alignment(_Fixed(np.eye(4)), "validation", 1)
+    _, card = load_checkpoint(default_weights(), kind="descriptor")
+    text = model_card(default_weights(), [row])
+    assert f"{card['samples_seen']:,} samples" in text
+    assert row.row() in text and "learning_rate" in text
