@@ -42,8 +42,6 @@ class VotingConfig:
     distinct: float = 0.5
     # A hypothesis is kept when its mean log-likelihood is this close to the best one's.
     margin: float = 0.12
-    # Weight of that difference in the vote: how many nodes count as independent evidence.
-    evidence: float = 0.0
     # Parts of the test objects that vote, and the share of the nodes in a part.
     parts: int = 32
     neighbourhood: float = 0.2
@@ -188,7 +186,6 @@ def _combine(A: list[Match], B: list[Match], config: VotingConfig) -> tuple[Tens
             (a.residual[i] / config.residual).square()[:, :, None]
             + (b.residual[j] / config.residual).square()[:, None]
         )
-        quality = quality + config.evidence * log_prior[best][:, None, None]
         padding = config.combinations - count
         if padding:
             X = torch.cat((X, X[:1].expand(padding, -1, -1, -1, -1)))
