@@ -34,8 +34,11 @@ class TrialResult:
     """What became of a trial."""
 
     task: str
+    # Name of the scenario's file without its suffix; the task's name where it isn't stated.
+    scenario: str = ""
     aligner: str
     seed: int
+    split: str = "test"
     success: bool
     # perception, alignment, IK, contact, time; "error" where the process itself broke.
     cause: str = ""
@@ -46,6 +49,14 @@ class TrialResult:
     inference_seconds: float | None = None
     real_time_factor: float | None = None
     wall_seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "scenario", self.scenario or self.task)
+
+    @property
+    def key(self) -> tuple[str, str, int, str]:
+        """What tells this trial from every other one."""
+        return self.scenario, self.aligner, self.seed, self.split
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -85,10 +96,11 @@ def run_trial(trial: Trial, *, task: str, split: str, timeout: float = 1800.0) -
         except subprocess.TimeoutExpired:
             reason = f"no verdict within {timeout:g} s of wall-clock time"
         if path.is_file():
-            return result_from_json(json.loads(path.read_text(encoding="utf-8")))
+            row = json.loads(path.read_text(encoding="utf-8"))
+            return result_from_json(row | {"scenario": Path(trial.scenario).stem})
     return TrialResult(
-        task=task, aligner=trial.aligner, seed=trial.seed, success=False, cause="error",
-        reason=reason,
+        task=task, scenario=Path(trial.scenario).stem, aligner=trial.aligner, seed=trial.seed,
+        split=split, success=False, cause="error", reason=reason,
     )  # fmt: skip
 
 
@@ -131,32 +143,25 @@ def evaluate(
     """Runs (task, trial) pairs, `processes` at a time, leaving out those in `results_file`.
 
     Each result is appended to `results_file` as soon as it is there, so an interrupted evaluation
-    goes on where it stopped.
+    goes on where it stopped. Trials are told apart by scenario, aligner, seed and split.
     """
-    known = (
-        {(r.task, r.aligner, r.seed): r for r in read_results(results_file)}
-        if (results_file)
-        else {}
-    )
+    known = {r.key: r for r in read_results(results_file)} if results_file else {}
     if results_file:
         _rewrite(results_file, known.values())
-    results: dict[tuple[str, str, int], TrialResult] = {}
 
-    def one(pair: tuple[str, Trial]) -> None:
+    def one(pair: tuple[str, Trial]) -> TrialResult:
         task, trial = pair
-        key = (task, trial.aligner, trial.seed)
-        result = known.get(key)
+        result = known.get((Path(trial.scenario).stem, trial.aligner, trial.seed, split))
         if result is None:
             result = run(trial, task=task, split=split)
             if results_file:
                 with results_file.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(asdict(result)) + "\n")
-        results[key] = result
         on_result(result)
+        return result
 
     with ThreadPoolExecutor(max_workers=max(1, processes)) as executor:
-        list(executor.map(one, trials))
-    return [results[(task, trial.aligner, trial.seed)] for task, trial in trials]
+        return list(executor.map(one, trials))
 
 
 def _rewrite(path: Path, results: Iterable[TrialResult]) -> None:
@@ -173,15 +178,16 @@ def _median(values: Iterable[float | None]) -> float | None:
 
 
 def summarise(results: Sequence[TrialResult]) -> list[dict[str, Any]]:
-    """One row for each task and aligner, in the order of their first result."""
+    """One row for each scenario and aligner, in the order of their first result."""
     rows = []
-    for task, aligner in dict.fromkeys((r.task, r.aligner) for r in results):
-        mine = [r for r in results if (r.task, r.aligner) == (task, aligner)]
+    for scenario, aligner in dict.fromkeys((r.scenario, r.aligner) for r in results):
+        mine = [r for r in results if (r.scenario, r.aligner) == (scenario, aligner)]
         successes = sum(r.success for r in mine)
         low, high = wilson_interval(successes, len(mine))
         rows.append(
             {
-                "task": task,
+                "task": mine[0].task,
+                "scenario": scenario,
                 "aligner": aligner,
                 "successes": successes,
                 "trials": len(mine),
@@ -202,9 +208,9 @@ def summarise(results: Sequence[TrialResult]) -> list[dict[str, Any]]:
 
 
 def format_table(results: Sequence[TrialResult]) -> str:
-    """The summary as text: one line for each task and aligner, then each failure's cause."""
+    """The summary as text: one line for each scenario and aligner, then each failure's cause."""
     lines = [
-        f"{'task':8} {'aligner':8} {'success':>8}  {'95 % (Wilson)':>14}  {'position':>9}  "
+        f"{'scenario':8} {'aligner':8} {'success':>8}  {'95 % (Wilson)':>14}  {'position':>9}  "
         f"{'rotation':>9}  {'inference':>9}  {'real time':>9}"
     ]
 
@@ -215,7 +221,7 @@ def format_table(results: Sequence[TrialResult]) -> str:
     for row in summarise(results):
         low, high = row["wilson_95"]
         lines.append(
-            f"{row['task']:8} {row['aligner']:8} {row['successes']:>3} / {row['trials']:<2}  "
+            f"{row['scenario']:8} {row['aligner']:8} {row['successes']:>3} / {row['trials']:<2}  "
             f"{100 * low:>5.0f} - {100 * high:>3.0f} %  "
             f"{number(row['median_position_error_m'], 100, 'cm'):>9}  "
             f"{number(row['median_rotation_error_rad'], 180 / math.pi, 'deg'):>9}  "
@@ -223,7 +229,7 @@ def format_table(results: Sequence[TrialResult]) -> str:
             f"{number(row['median_real_time_factor'], 1, 'x'):>9}"
         )
         failures += [
-            f"  {row['task']} {row['aligner']} seed {f['seed']}: {f['cause']}: {f['reason']}"
+            f"  {row['scenario']} {row['aligner']} seed {f['seed']}: {f['cause']}: {f['reason']}"
             for f in row["failures"]
         ]
     if failures:

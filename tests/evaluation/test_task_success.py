@@ -46,7 +46,8 @@ class FakeRun:
         self.seeds.append(trial.seed)
         good = trial.seed >= 2
         return TrialResult(
-            task=task, aligner=trial.aligner, seed=trial.seed, success=good,
+            task=task, scenario=Path(trial.scenario).stem, aligner=trial.aligner, seed=trial.seed,
+            split=split, success=good,
             cause="" if good else "contact", reason="" if good else "slipped",
             position_error=0.01 * trial.seed,
         )  # fmt: skip
@@ -67,6 +68,26 @@ def test_an_interrupted_evaluation_goes_on(tmp_path: Path):
     assert run.seeds == [3, 4]
     assert results == read_results(path)
     assert [json.loads(line)["seed"] for line in path.read_text().splitlines()] == list(range(5))
+
+
+def test_results_of_another_split_or_scenario_are_not_taken_over(tmp_path: Path):
+    path = tmp_path / "results.jsonl"
+    evaluate(make_trials([0]), results_file=path, run=FakeRun())
+    run = FakeRun()
+    evaluate(make_trials([0]), split="demonstration", results_file=path, run=run)
+    other = [("grasp", Trial(scenario="dark.yaml", aligner="icp", seed=0))]
+    results = evaluate(make_trials([0]) + other, results_file=path, run=run)
+    assert run.seeds == [0, 0]
+    assert [row["scenario"] for row in summarise(results)] == ["grasp", "dark"]
+    assert len(read_results(path)) == 3
+
+
+def test_a_row_that_states_neither_is_of_the_tasks_own_scenario(tmp_path: Path):
+    path = tmp_path / "results.jsonl"
+    path.write_text('{"task": "grasp", "aligner": "icp", "seed": 4, "success": true}\n')
+    run = FakeRun()
+    (result,) = evaluate(make_trials([4]), results_file=path, run=run)
+    assert result.success and not run.seeds
 
 
 def test_a_broken_line_in_the_middle_is_refused(tmp_path: Path):
