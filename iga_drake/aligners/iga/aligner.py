@@ -1,10 +1,10 @@
 """The `iga` aligner: learned dense correspondence and consistency voting (variant `factorised`).
 
 Everything is invariant under separate rigid motions of the test clouds and of each demonstration,
-up to
-the choice of nodes, which furthest point sampling makes from the clouds' own geometry.
+up to the choice of nodes, which furthest point sampling makes from the clouds' own geometry.
 """
 
+import copy
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,14 +52,15 @@ class IgaAligner:
     ):
         """Takes a network, or reads `weights` (default: the landed checkpoint).
 
-        Raises `CheckpointError` (see `training.checkpoint`) for a missing or foreign file.
+        The network itself is left as it is. Raises `CheckpointError` (`aligners.checkpoint`) for a
+        missing or foreign file.
         """
         if net is None:
             from iga_drake.aligners.iga.weights import load_descriptor
 
             net, _ = load_descriptor(Path(weights) if weights else default_weights())
         # Double precision: choices between near ties must not depend on the clouds' frame.
-        self._net = net.eval().double()
+        self._net = copy.deepcopy(net).eval().double()
         self.config = config or IgaConfig()
         self.voting = voting or VotingConfig()
 

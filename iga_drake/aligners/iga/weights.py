@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from iga_drake.aligners.checkpoint import load_checkpoint
+from iga_drake.aligners.checkpoint import CheckpointError, load_checkpoint
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
 
 DESCRIPTOR = "descriptor"
@@ -18,7 +18,13 @@ def descriptor_config(card: dict) -> DescriptorConfig:
 def load_descriptor(path: Path) -> tuple[DescriptorNet, dict]:
     """The trained network (evaluation mode) and its card; raises `CheckpointError`."""
     tensors, card = load_checkpoint(path, kind=DESCRIPTOR)
-    net = DescriptorNet(descriptor_config(card))
-    net.load_state_dict(tensors)
+    try:
+        net = DescriptorNet(descriptor_config(card))
+        net.load_state_dict(tensors)
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise CheckpointError(
+            f"{path}: card and tensors don't describe this release's network ({error}): train one "
+            "with `iga train` or name another"
+        ) from error
     net.eval().requires_grad_(False)
     return net, card
