@@ -34,16 +34,3 @@ def voxel_indices(points: np.ndarray, size: float) -> np.ndarray:
     span = cells.max(0) + 1
     keys = (cells[:, 0] * span[1] + cells[:, 1]) * span[2] + cells[:, 2]
     return np.unique(keys, return_index=True)[1]
-
-
-def voxel_downsample(points: np.ndarray, size: float) -> np.ndarray:
-    """One centroid (M, 3) per occupied voxel of points (P, 3)."""
-    if len(points) == 0:
-        return points.reshape(0, 3)
-    cells = np.floor(points / size).astype(np.int64)
-    cells -= cells.min(0)
-    span = cells.max(0) + 1
-    keys = (cells[:, 0] * span[1] + cells[:, 1]) * span[2] + cells[:, 2]
-    _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(inverse, weights=points[:, k]) for k in range(3)], 1)
-    return sums / counts[:, None]

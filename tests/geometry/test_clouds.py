@@ -1,11 +1,10 @@
-"""Sampling of clouds against brute force and Open3D."""
+"""Sampling of clouds against brute force."""
 
 import numpy as np
-import open3d
 import pytest
 import torch
 
-from iga_drake.geometry.clouds import furthest_point_sampling, voxel_downsample, voxel_indices
+from iga_drake.geometry.clouds import furthest_point_sampling, voxel_indices
 
 
 def test_furthest_point_sampling_is_greedy_and_distinct() -> None:
@@ -30,29 +29,9 @@ def test_too_many_samples_are_refused() -> None:
         furthest_point_sampling(torch.zeros(1, 5, 3), 9)
 
 
-def test_voxel_downsample_matches_open3d() -> None:
-    points = np.random.default_rng(0).uniform(-0.1, 0.1, (5000, 3))
-    # Open3D's grid starts half a voxel below the minimum: give it the same origin by a corner
-    # point.
-    corner = np.floor(points.min(0) / 0.01) * 0.01 + 0.005
-    points = np.concatenate((points, corner[None]))
-    points = points[(points >= corner - 1e-12).all(1)]
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-    expected = np.asarray(cloud.voxel_down_sample(0.01).points)
-    ours = voxel_downsample(points, 0.01)
-    assert ours.shape == expected.shape
-    np.testing.assert_allclose(
-        ours[np.lexsort(ours.round(9).T)], expected[np.lexsort(expected.round(9).T)], atol=1e-9
-    )
-
-
 def test_voxel_indices_keep_one_point_per_voxel() -> None:
     points = np.random.default_rng(1).normal(size=(2000, 3)) * 0.05
     kept = points[voxel_indices(points, 0.01)]
     cells = np.floor(kept / 0.01).astype(int)
     assert len(np.unique(cells, axis=0)) == len(kept)
     assert len(kept) == len(np.unique(np.floor(points / 0.01).astype(int), axis=0))
-
-
-def test_empty_cloud_stays_empty() -> None:
-    assert voxel_downsample(np.zeros((0, 3)), 0.01).shape == (0, 3)

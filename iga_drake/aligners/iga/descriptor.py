@@ -15,8 +15,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from iga_drake.geometry.clouds import furthest_point_sampling
-
 
 @dataclass(frozen=True)
 class DescriptorConfig:
@@ -218,8 +216,3 @@ class DescriptorNet(nn.Module):
     def similarity(self, a: Tensor, b: Tensor) -> Tensor:
         """Logits (..., M, N) of a match between descriptors (..., M, D) and (..., N, D)."""
         return self.log_temperature.clamp(max=4.6).exp() * (a @ b.transpose(-1, -2))
-
-
-def sample_nodes(points: Tensor, count: int) -> Tensor:
-    """Node indices (B, count): deterministic furthest point sampling."""
-    return furthest_point_sampling(points, min(count, points.shape[1]))
