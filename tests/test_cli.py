@@ -91,6 +91,13 @@ def test_evaluate_refuses_what_it_does_not_know(capsys):
     assert "--tasks: empty" in refused(capsys, "evaluate", "tasks", "--tasks", ",")
 
 
+@pytest.mark.parametrize(
+    "arguments", [("fusion", "--repetitions"), ("inference", "--count"), ("ik", "--count")]
+)
+def test_benchmarks_of_nothing_are_refused(capsys, arguments: tuple[str, str]):
+    assert "at least" in refused(capsys, "benchmark", *arguments, "0")
+
+
 def test_a_folder_that_is_not_demonstrations_is_refused_before_recording(capsys, tmp_path: Path):
     (tmp_path / "thesis.tex").touch()
     line = refused(capsys, "demonstrate", "grasp", "--out", str(tmp_path))

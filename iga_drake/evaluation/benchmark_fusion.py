@@ -17,6 +17,7 @@ from pydrake.math import RigidTransform
 from pydrake.perception import Concatenate, DepthImageToPointCloud
 from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I
 
+from iga_drake.errors import IgaDrakeError
 from iga_drake.station.cameras import camera_info
 from iga_drake.station.panda import HOME_POSITION
 from iga_drake.station.ports import Role
@@ -61,6 +62,8 @@ def benchmark_fusion(*, json: bool = False, repetitions: int = 15) -> dict:
     Times in milliseconds of wall clock, and of processor time (all threads) for comparison on a
     busy machine; `ratio` is the median over that of ours for whole images.
     """
+    if repetitions < 1:
+        raise IgaDrakeError(f"--repetitions {repetitions}: at least 1 is needed")
     scenario = Scenario()
     scenario.panda.visuals = "primitives"
     images = render_images(scenario)

@@ -12,6 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus
 
+from iga_drake.errors import IgaDrakeError
 from iga_drake.station.panda_planning import make_panda_planning_robot
 from iga_drake.systems.differential_ik import DifferentialIk
 from iga_drake.systems.forward_kinematics import ForwardKinematics
@@ -123,7 +124,7 @@ def benchmark_ik(count: int = 1000, seed: int = 0, json: bool = False) -> IkBenc
     inverse kinematics; the joint angles that the solver finds for it are the nominal posture.
     """
     if count < 1:
-        raise ValueError(f"count {count}: at least one pose is needed")
+        raise IgaDrakeError(f"count {count}: at least one pose is needed")
     robot = make_panda_planning_robot()
     # The watch measures distances to the table where it really is.
     truth = make_panda_planning_robot(safety_distance=0.0, table_distance=0.0)

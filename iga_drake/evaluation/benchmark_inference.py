@@ -11,6 +11,7 @@ import torch
 from iga_drake.aligners.protocol import Aligner, Alignment
 from iga_drake.aligners.registry import make_aligner
 from iga_drake.dataset.samples import make_sample
+from iga_drake.errors import IgaDrakeError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,6 +37,9 @@ def _times(aligner: Aligner, count: int, demonstrations: int) -> np.ndarray:
 
 def main(arguments: argparse.Namespace) -> int:
     """Prints median, minimum and maximum of both aligners and the ratio of the medians."""
+    for name in ("count", "threads"):
+        if getattr(arguments, name) < 1:
+            raise IgaDrakeError(f"--{name} {getattr(arguments, name)}: at least 1 is needed")
     torch.set_num_threads(arguments.threads)
     result: dict[str, dict[str, float]] = {}
     for name in ("iga", "icp"):

@@ -2,6 +2,7 @@ import json
 
 import pytest
 
+from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.benchmark_ik import benchmark_ik, main
 
 
@@ -25,5 +26,5 @@ def test_command_line_prints_json_and_repeats_itself(capsys):
 
 
 def test_no_poses_are_refused():
-    with pytest.raises(ValueError, match="count 0"):
+    with pytest.raises(IgaDrakeError, match="count 0"):
         benchmark_ik(count=0)
