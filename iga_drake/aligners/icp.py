@@ -1,9 +1,9 @@
 """The ICP baseline: registers a demonstration's objects with the test objects, rigidly.
 
 Per demonstration the grasped and the target cloud are registered with the test's (Open3D,
-multi-start,
-point-to-plane); with `X_A`, `X_B` from demonstration to test the answer is `X_B X_A^-1`. The best
-demonstration is the one with the smallest mean distance of both registrations.
+multi-start, point-to-plane); with `X_A`, `X_B` from demonstration to test the answer is
+`X_B X_A^-1`. The best demonstration is the one with the smallest mean distance of both
+registrations.
 """
 
 import numpy as np

@@ -1,10 +1,9 @@
 """Consistently aligned object pairs as a pure function of (split, index).
 
 One sample (paper, "Generalisation Through Shape Augmentation"): two categories, N deformed
-instances of
-each with known correspondence, aligned so that the neighbourhood of one point on each object keeps
-its relative pose, seen by three depth cameras. Every observed point carries its place on the
-canonical instance, in units of that instance's size.
+instances of each with known correspondence, aligned so that the neighbourhood of one point on each
+object keeps its relative pose, seen by three depth cameras. Every observed point carries its place
+on the canonical instance, in units of that instance's size.
 """
 
 from dataclasses import dataclass

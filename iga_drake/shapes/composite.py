@@ -1,8 +1,7 @@
 """Abstract composite shapes: random assemblies of closed parts, with part-wise variation.
 
 A category is drawn once (which parts, where they sit); its instances vary each part's size, bend
-and
-place. All instances of a category share faces and vertex order.
+and place. All instances of a category share faces and vertex order.
 """
 
 from dataclasses import dataclass

@@ -1,13 +1,10 @@
 """SE(3)-invariant dense descriptors of a point cloud, with whole-object context.
 
 Every node carries invariant scalars and equivariant vectors (Vector Neurons, Deng et al. 2021).
-Layers
-attend over all nodes of the object with invariant pair features only, and pass equivariant
-messages. Cross and triple products make the features sensitive to handedness: without them the
-left and
-the right side of a mirror-symmetric object would look the same. The result is exactly invariant
-under
-rotations and translations, and independent of the order of the points for given nodes.
+Layers attend over all nodes of the object with invariant pair features only, and pass equivariant
+messages. Cross and triple products make the features sensitive to handedness: without them the left
+and the right side of a mirror-symmetric object would look the same. The result is exactly invariant
+under rotations and translations, and independent of the order of the points for given nodes.
 """
 
 from dataclasses import dataclass
