@@ -6,7 +6,8 @@ BIN := $(VENV)/bin
 # The CPU build that this release was tested with; a newer Python gets the newest torch.
 TORCH ?= torch==2.13.0
 EXTRAS := icp,visuals,notebook,dev
-PACKAGES := libusb-1.0-0 libgl1 libegl1 libgl1-mesa-dri libgomp1 python3-venv
+# Some releases add t64 to a package's name.
+PACKAGES := libglib2.0-0 libusb-1.0-0 libgl1 libegl1 libgl1-mesa-dri libgomp1 python3-venv
 
 .PHONY: demo test check setup clean
 .DEFAULT_GOAL := setup
@@ -33,7 +34,7 @@ $(VENV)/.system:
 	@missing=""; \
 	if command -v dpkg-query >/dev/null 2>&1; then \
 	  for package in $(PACKAGES); do \
-	    dpkg-query -W -f='$${Status}' $$package 2>/dev/null | grep -q 'ok installed' || missing="$$missing $$package"; \
+	    dpkg-query -W -f='$${Status}\n' $$package $${package}t64 2>/dev/null | grep -q 'ok installed' || missing="$$missing $$package"; \
 	  done; \
 	fi; \
 	if [ "$$missing" = " python3-venv" ] && $(PYTHON) -c 'import ensurepip, venv' 2>/dev/null; then missing=""; fi; \
