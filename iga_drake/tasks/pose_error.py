@@ -5,15 +5,11 @@ from collections.abc import Iterable
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
+from iga_drake.systems.paths import pose_error
+
 # Families that are the same turned about their z axis.
 ROUND_FAMILIES = ("bowl",)
 _TURNS = 360
-
-
-def pose_error(predicted: RigidTransform, expert: RigidTransform) -> tuple[float, float]:
-    """Distance (m) and angle (rad) between two poses."""
-    X = expert.inverse() @ predicted
-    return float(np.linalg.norm(X.translation())), float(X.rotation().ToAngleAxis().angle())
 
 
 def equivalent_poses(
