@@ -26,6 +26,7 @@ from scipy.spatial import cKDTree
 
 from iga_drake.station import panda as panda_module
 from iga_drake.station.panda import (
+    ACCELERATION_LIMIT,
     EFFORT_LIMIT,
     HOME_POSITION,
     POSITION_LOWER,
@@ -107,6 +108,7 @@ def test_mass_and_limits_agree_with_pinocchio(panda, pinocchio_model):
     np.testing.assert_allclose(pinocchio_model.upperPositionLimit[:7], POSITION_UPPER)
     np.testing.assert_allclose(plant.GetVelocityUpperLimits()[:7], VELOCITY_LIMIT)
     np.testing.assert_allclose(pinocchio_model.velocityLimit[:7], VELOCITY_LIMIT)
+    np.testing.assert_allclose(plant.GetAccelerationUpperLimits()[:7], ACCELERATION_LIMIT)
     np.testing.assert_allclose([a.effort_limit() for a in panda.arm_actuators], EFFORT_LIMIT)
     np.testing.assert_allclose(pinocchio_model.effortLimit[:7], EFFORT_LIMIT)
 
