@@ -26,10 +26,6 @@ class ForwardKinematics(LeafSystem):
         super().__init__()
         self.set_name("ForwardKinematics")
         self._robot = robot
-        self._plant = robot.checker.plant()
-        self._plant_context = (
-            self._plant.CreateDefaultContext()
-        )  # scratch, overwritten by each calc
         self._position_input = self.DeclareVectorInputPort("position", len(robot.indices))
         self.DeclareAbstractOutputPort(
             "pose",
