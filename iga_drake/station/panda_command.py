@@ -1,5 +1,7 @@
 """From the port contract's commands to the desired state of the Panda's actuators."""
 
+import math
+
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
@@ -48,56 +50,43 @@ class PandaCommand(LeafSystem):
         self._opening_step = opening_speed * time_step
         self._position_input = self.DeclareVectorInputPort("panda.position", PANDA_JOINTS)
         self._opening_input = self.DeclareVectorInputPort("hand.opening", 1)
-        # Angles, angular velocities, opening, opening velocity; NaN until the first command.
-        self._state = self.DeclareDiscreteState(np.full(2 * PANDA_JOINTS + 2, np.nan))
+        # The desired state; NaN until the first command.
+        self._state = self.DeclareDiscreteState(np.full(2 * _ACTUATORS, np.nan))
         self.DeclarePeriodicDiscreteUpdateEvent(time_step, 0.0, self._update)
         self.DeclareVectorOutputPort("desired_state", 2 * _ACTUATORS, self._calc_desired_state)
         self.DeclareVectorOutputPort("hand.opening_commanded", 1, self._calc_opening)
 
     def _read(self, context: Context) -> np.ndarray:
-        """The state, or the commands at rest where there is no state yet."""
-        state = context.get_discrete_state(self._state).value()
-        if np.isfinite(state).all():
-            return state.copy()
-        return np.concatenate(
-            [
-                self._position_input.Eval(context),
-                np.zeros(PANDA_JOINTS),
-                np.clip(self._opening_input.Eval(context), 0.0, HAND_OPENING_MAX),
-                np.zeros(1),
-            ]
-        )
+        """The state, or the commands at rest where there is no state yet; not to be written to."""
+        state = context.get_discrete_state_vector().value()
+        if math.isfinite(state.sum()):
+            return state
+        state = np.zeros(2 * _ACTUATORS)
+        state[:PANDA_JOINTS] = self._position_input.Eval(context)
+        state[PANDA_JOINTS:_ACTUATORS] = self._read_opening(context) / 2
+        return state
+
+    def _read_opening(self, context: Context) -> float:
+        """The opening commanded (m), as far as the hand can do it."""
+        return min(max(float(self._opening_input.Eval(context)[0]), 0.0), HAND_OPENING_MAX)
 
     def _update(self, context: Context, values) -> None:
+        # Runs at every step of the plant: plain floats and slices, which are quicker than arrays.
         state = self._read(context)
-        position, opening = state[:PANDA_JOINTS], state[-2]
+        new = np.empty(2 * _ACTUATORS)
+        position = state[:PANDA_JOINTS]
         change = self._gain * (self._position_input.Eval(context) - position)
-        wanted = np.clip(self._opening_input.Eval(context)[0], 0.0, HAND_OPENING_MAX)
-        step = np.clip(wanted - opening, -self._opening_step, self._opening_step)
-        values.set_value(
-            self._state,
-            np.concatenate(
-                [
-                    position + change,
-                    change / self._time_step,
-                    [opening + step, step / self._time_step],
-                ]
-            ),
-        )
+        new[:PANDA_JOINTS] = position + change
+        new[_ACTUATORS:-2] = change / self._time_step
+        opening = 2.0 * float(state[PANDA_JOINTS])
+        step = self._read_opening(context) - opening
+        step = min(max(step, -self._opening_step), self._opening_step)
+        new[PANDA_JOINTS:_ACTUATORS] = (opening + step) / 2
+        new[-2:] = step / self._time_step / 2
+        values.set_value(self._state, new)
 
     def _calc_desired_state(self, context: Context, output: BasicVector) -> None:
-        state = self._read(context)
-        half, half_rate = state[-2] / 2, state[-1] / 2
-        output.SetFromVector(
-            np.concatenate(
-                [
-                    state[:PANDA_JOINTS],
-                    [half, half],
-                    state[PANDA_JOINTS : 2 * PANDA_JOINTS],
-                    [half_rate, half_rate],
-                ]
-            )
-        )
+        output.SetFromVector(self._read(context))
 
     def _calc_opening(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([self._read(context)[-2]])
+        output.SetFromVector([2.0 * self._read(context)[PANDA_JOINTS]])

@@ -100,6 +100,10 @@ class PolicyMemory:
     steps: tuple[MotionStep, ...] = ()
     step: int = 0
 
+    def __deepcopy__(self, memo: dict) -> "PolicyMemory":
+        """Itself: it is replaced, never changed, and Drake copies it at every update."""
+        return self
+
 
 class PolicyMachine:
     """Observe, infer, execute.
