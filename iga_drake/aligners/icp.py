@@ -55,10 +55,10 @@ class IcpAligner:
                 coarse_s, coarse_g, 0.1, X, reg.TransformationEstimationPointToPoint(),
                 reg.ICPConvergenceCriteria(max_iteration=15),
             )  # fmt: skip
-            trials.append((result.inlier_rmse, result.transformation))
-        trials.sort(key=lambda trial: trial[0])
+            trials.append((-result.fitness, result.inlier_rmse, result.transformation))
+        trials.sort(key=lambda trial: trial[:2])
         best: tuple[float, np.ndarray] | None = None
-        for _, X in trials[: self.refined]:
+        for *_, X in trials[: self.refined]:
             result = reg.registration_icp(
                 source, goal, 0.03, X, reg.TransformationEstimationPointToPlane(),
                 reg.ICPConvergenceCriteria(max_iteration=40),

@@ -42,5 +42,10 @@ def main(arguments: argparse.Namespace) -> int:
         minutes=arguments.minutes,
         initial=arguments.initial,
     )
-    print(f"step {card['step']}, {card['samples_seen']} samples seen, {card['seconds']:.0f} s")
+    scores = card["validation"]
+    print(
+        f"step {card['step']}, {card['samples_seen']} samples seen, {card['seconds']:.0f} s; "
+        f"validation: top-1 {scores['top1']:.3f}, match error {100 * scores['error_mean']:.1f} % of the "
+        f"size (mean), {100 * scores['error_median']:.1f} % (median)"
+    )
     return 0

@@ -1,8 +1,7 @@
 """Trains the dense descriptors by contrastive correspondence between the instances of a sample.
 
 Loss: for every ordered pair of instances of one object, cross-entropy between the match logits of
-each
-node and a soft target, a Gaussian in the canonical space (InfoNCE with soft positives).
+each node and a soft target, a Gaussian in the canonical space (InfoNCE with soft positives).
 """
 
 import dataclasses
@@ -142,10 +141,14 @@ def train_descriptor(
     initial: Path | None = None,
     checkpoint_every: int = 200,
     stop_at: int | None = None,
+    validation_count: int = 64,
 ) -> dict:
-    """Trains until `config.steps`, `stop_at` or `minutes`; writes `output`/descriptor.safetensors
-    (EMA weights)
-    and `output`/state.safetensors (all that resuming needs). Returns the model card."""
+    """Trains until `config.steps`, `stop_at` or `minutes`; resumes from `output` where it can.
+
+    Writes `output`/descriptor.safetensors (EMA weights), `output`/state.safetensors (all that
+    resuming needs) and `output`/log.jsonl. Returns the model card, which ends with the statistics
+    of the EMA weights over `validation_count` samples of the validation split.
+    """
     config, samples = config or DescriptorTraining(), samples or SampleConfig()
     state_path = output / "state.safetensors"
     torch.manual_seed(config.seed)
@@ -238,4 +241,11 @@ def train_descriptor(
                 )
         if step % checkpoint_every == 0:
             write()
-    return write()
+    card = write()
+    final = DescriptorNet(net.config).to(device)
+    final.load_state_dict(ema)
+    card["validation"] = validate(
+        final, config, samples, split="validation", count=validation_count
+    )
+    save_checkpoint(output / "descriptor.safetensors", ema, kind=KIND, card=card)
+    return card

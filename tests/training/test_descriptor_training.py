@@ -19,6 +19,7 @@ def _config(steps: int, **changes) -> DescriptorTraining:
 
 
 def _train(folder: Path, config: DescriptorTraining, **options) -> dict:
+    options.setdefault("validation_count", 2)
     return train_descriptor(folder, model=MODEL, config=config, samples=SAMPLES, **options)
 
 

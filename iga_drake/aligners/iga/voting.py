@@ -1,13 +1,10 @@
 """Consistency voting: closed-form proposals of the alignment from dense soft matches.
 
 Per demonstration and object the descriptors' match logits are turned into a few *global
-hypotheses*, coarse
-motions that are each consistent with themselves (a symmetric object has several). Under every
-hypothesis, the neighbourhood of each test node is carried rigidly onto its matched points. A pair
-of
-parts (i of A, j of B) then proposes `X_B^-1 X_A` once per demonstration; pairs whose proposals
-agree over
-the demonstrations are what the task is about.
+hypotheses*, coarse motions that are each consistent with themselves (a symmetric object has
+several). Under every hypothesis, the neighbourhood of each test node is carried rigidly onto its
+matched points. A pair of parts (i of A, j of B) then proposes `X_B^-1 X_A` once per demonstration;
+pairs whose proposals agree over the demonstrations are what the task is about.
 """
 
 import math
@@ -97,8 +94,7 @@ def global_hypotheses(
     """Coarse motions (H, 4, 4) of unit-scaled test nodes x (M, 3) onto y (N, 3), best first.
 
     Triplets of matches drawn from the soft matching, fitted (Kabsch), scored by the likelihood of
-    all
-    nodes under descriptors and geometry, refined by expectation maximisation.
+    all nodes under descriptors and geometry, refined by expectation maximisation.
     """
     M = len(x)
     log_p = logits.log_softmax(-1)
