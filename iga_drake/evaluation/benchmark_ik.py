@@ -17,7 +17,7 @@ from iga_drake.station.panda_planning import make_panda_planning_robot
 from iga_drake.systems.differential_ik import DifferentialIk
 from iga_drake.systems.forward_kinematics import ForwardKinematics
 from iga_drake.systems.inverse_kinematics import PoseSolver
-from iga_drake.systems.messages import EndEffectorTarget
+from iga_drake.systems.messages import NO_TARGET, EndEffectorTarget
 from iga_drake.systems.planning_robot import PlanningRobot
 from iga_drake.systems.waypoint_follower import WaypointFollower
 
@@ -147,7 +147,7 @@ def benchmark_ik(count: int = 1000, seed: int = 0, json: bool = False) -> IkBenc
     controller.set_initial_position(context, robot.home)
     watch = _Watch(truth, controller, position, 0.005)
     target_port, status_port = diagram.GetInputPort("target"), follower.GetOutputPort("status")
-    target_port.FixValue(context, Value[object](None))
+    target_port.FixValue(context, Value[object](NO_TARGET))
     simulator.set_monitor(watch)
     simulator.Initialize()
 

@@ -46,10 +46,11 @@ class IgaPolicy(LeafSystem):
         - grasped_observed
 
     `camera_counts` is a dict of camera name -> value with `valid`, the pixels with a depth.
-    `target` is an `EndEffectorTarget`, or None while the arm has not been asked to move; `status` a
-    `PolicyStatus` (phase, timeline, reason), `estimate` a `PoseEstimate` or None, `energy` the
-    energy of the chosen pose (NaN before there is one), `target_observed` the observed target cloud
-    in W, `grasped_observed` the grasped cloud in E that the aligner was given.
+    `target` is an `EndEffectorTarget`, of sequence 0 while the arm has not been asked to move;
+    `status` a `PolicyStatus` (phase, timeline, reason); `estimate` a tuple of the `PoseEstimate`,
+    empty before there is one; `energy` the energy of the chosen pose (NaN before there is one);
+    `target_observed` the observed target cloud in W; `grasped_observed` the grasped cloud in E that
+    the aligner was given.
     """
 
     def __init__(self, machine: PolicyMachine) -> None:
@@ -79,9 +80,9 @@ class IgaPolicy(LeafSystem):
                 name, lambda: AbstractValue.Make(example), calc, prerequisites_of_calc=state
             )
 
-        declare("target", None, lambda m: m.target if m.target.sequence > 0 else None)
+        declare("target", start.target, lambda memory: memory.target)
         declare("status", start.status, lambda memory: memory.status)
-        declare("estimate", None, lambda memory: memory.estimate)
+        declare("estimate", (), lambda m: () if m.estimate is None else (m.estimate,))
         declare("target_observed", PointCloud(), lambda m: to_point_cloud(m.target_points))
         declare("grasped_observed", PointCloud(), lambda m: to_point_cloud(m.grasped_points_E))
         self.DeclareVectorOutputPort("energy", 1, self._calc_energy, prerequisites_of_calc=state)
@@ -114,10 +115,10 @@ class _Pull:
         return port.Eval(self._context)
 
     def target_cloud(self) -> np.ndarray:
-        return self._read(self._policy._target_cloud_input).xyzs().T
+        return self._read(self._policy._target_cloud_input).xyzs().T.copy()
 
     def grasped_cloud(self) -> np.ndarray:
-        return self._read(self._policy._grasped_cloud_input).xyzs().T
+        return self._read(self._policy._grasped_cloud_input).xyzs().T.copy()
 
     def silent_cameras(self) -> tuple[str, ...]:
         port = self._policy._counts_input

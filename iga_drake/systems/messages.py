@@ -29,6 +29,12 @@ class EndEffectorTarget:
     contact_force: float | None = None
 
 
+# What a port carries before there is any target. (Drake's abstract values can't hold None.)
+NO_TARGET = EndEffectorTarget(
+    sequence=0, X_WE=RigidTransform(), opening_moving=0.0, opening_reached=0.0
+)
+
+
 @dataclass(frozen=True)
 class FollowerStatus:
     """What the waypoint follower reports."""

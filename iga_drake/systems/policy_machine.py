@@ -249,7 +249,8 @@ class PolicyMachine:
             estimate = self._aligner.align(
                 context, memory.grasped_points_E, memory.target_points, seed=self.config.seed
             )
-        except IgaDrakeError as error:
+        except (IgaDrakeError, RuntimeError, np.linalg.LinAlgError) as error:
+            # Refused input, or numerics that gave up (PyTorch, Open3D, NumPy): the arm holds.
             return self._refuse(memory, now, f"aligner {self._aligner.name}: {error}", "alignment")
         seconds = wall.perf_counter() - began
         status = replace(

@@ -78,9 +78,9 @@ class WaypointFollower(LeafSystem):
         - nominal_posture
         - status
 
-    - `target` (EndEffectorTarget, or None before there is any): a new `sequence` starts a motion
-      from the last commanded pose, or from the measured one if the arm didn't get there; linear and
-      angular speed stay within their limits and both motions end together.
+    - `target` (EndEffectorTarget, of sequence 0 before there is any): a new `sequence` starts a
+      motion from the last commanded pose, or from the measured one if the arm didn't get there;
+      linear and angular speed stay within their limits and both motions end together.
     - `pose_measured` (RigidTransform): X_WE.
     - `position_measured` (N, rad): the arm's joints. If it is connected and a `solver` was given,
       a straight line that the arm can't follow is replaced by a path through the joints.
@@ -143,7 +143,7 @@ class WaypointFollower(LeafSystem):
         X_WE = RigidTransform(self._pose_input.Eval(context))  # a copy: Eval refers to the cache
         target = self._target_input.Eval(context)
         desired = motion.X_WDesired or X_WE
-        if target is not None and (
+        if target.sequence > 0 and (
             motion.target is None or target.sequence != motion.target.sequence
         ):
             motion = self._start(context, motion, self._check(target), desired, X_WE)

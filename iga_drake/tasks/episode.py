@@ -28,6 +28,8 @@ from iga_drake.tasks.task import Snapshot, Split, Task, TaskError
 EXPERT = "expert"
 # How many of the demonstrations make up the context.
 CONTEXT_SIZE = 3
+# Keeps the cameras' seeds of test episodes apart from those of demonstrations.
+TEST_SEED_OFFSET = 1_000_000
 # Time between two snapshots of the true state (s).
 SNAPSHOT_PERIOD = 0.05
 # Time for which the world goes on once the policy is done, or has given up (s).
@@ -161,7 +163,8 @@ def run_episode(
         scenario,
         task=task,
         scene=task.scene(seed + scenario.seeds.scene, split),
-        seed=seed,
+        # Other draws of calibration and noise than any demonstration's with the same seed.
+        seed=seed + (TEST_SEED_OFFSET if split == "test" else 0),
         aligner=chosen,
         demonstrations=demonstrations,
         meshcat=meshcat,

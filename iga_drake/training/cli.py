@@ -45,7 +45,8 @@ def main(arguments: argparse.Namespace) -> int:
     scores = card["validation"]
     print(
         f"step {card['step']}, {card['samples_seen']} samples seen, {card['seconds']:.0f} s; "
-        f"validation: top-1 {scores['top1']:.3f}, match error {100 * scores['error_mean']:.1f} % of the "
-        f"size (mean), {100 * scores['error_median']:.1f} % (median)"
+        f"validation: top-1 {scores['top1']:.3f}, match error "
+        f"{100 * scores['error_mean']:.1f} % of the size (mean), "
+        f"{100 * scores['error_median']:.1f} % (median)"
     )
     return 0

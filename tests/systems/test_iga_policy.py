@@ -7,7 +7,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from iga_drake.systems.iga_policy import IgaPolicy, to_point_cloud
-from iga_drake.systems.messages import FollowerStatus
+from iga_drake.systems.messages import NO_TARGET, FollowerStatus
 from iga_drake.systems.policy_sequence import Phase
 
 
@@ -32,14 +32,14 @@ class ReachesAtOnce(LeafSystem):
 
     def __init__(self, policy: IgaPolicy) -> None:
         super().__init__()
-        self._input = self.DeclareAbstractInputPort("target", AbstractValue.Make(None))
+        self._input = self.DeclareAbstractInputPort("target", AbstractValue.Make(NO_TARGET))
         index = self.DeclareAbstractState(AbstractValue.Make(FollowerStatus()))
         self.DeclareStateOutputPort("status", index)
         self.DeclarePeriodicUnrestrictedUpdateEvent(0.2, 0.1, self._update)
 
     def _update(self, context, state) -> None:
         target = self._input.Eval(context)
-        reached = 0 if target is None else target.sequence
+        reached = target.sequence
         state.get_mutable_abstract_state(0).set_value(FollowerStatus(sequence_reached=reached))
 
 
@@ -62,8 +62,8 @@ def test_runs_in_a_diagram_and_renders_only_while_observing():
     aligner = FakeAligner()
     policy, cloud, simulator, context = build(aligner)
     assert np.isnan(policy.GetOutputPort("energy").Eval(context)[0])
-    assert policy.GetOutputPort("estimate").Eval(context) is None
-    assert policy.GetOutputPort("target").Eval(context) is None
+    assert policy.GetOutputPort("estimate").Eval(context) == ()
+    assert policy.GetOutputPort("target").Eval(context).sequence == 0
     simulator.AdvanceTo(0.4)
     assert cloud.count == 0, "the scene is still coming to rest"
     simulator.AdvanceTo(10.0)
@@ -72,7 +72,7 @@ def test_runs_in_a_diagram_and_renders_only_while_observing():
     assert cloud.count == 1
     assert len(aligner.calls) == 1, "inference ran once, whatever was evaluated"
     assert policy.GetOutputPort("energy").Eval(context)[0] == 0.0
-    assert len(policy.GetOutputPort("estimate").Eval(context).poses) == 1
+    assert len(policy.GetOutputPort("estimate").Eval(context)[0].poses) == 1
     observed = policy.GetOutputPort("target_observed").Eval(context).xyzs().T
     np.testing.assert_allclose(observed, TARGET, atol=1e-6)
     grasped = policy.GetOutputPort("grasped_observed").Eval(context).xyzs().T

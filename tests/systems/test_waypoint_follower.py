@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from iga_drake.errors import IgaDrakeError
-from iga_drake.systems.messages import EndEffectorTarget
+from iga_drake.systems.messages import NO_TARGET, EndEffectorTarget
 from iga_drake.systems.paths import pose_error
 from iga_drake.systems.waypoint_follower import WaypointFollower, WaypointFollowerConfig
 
@@ -31,7 +31,7 @@ class Run:
         self.context = self.simulator.get_mutable_context()
         self.steps = 0
         self.measure(X_START)
-        self.send(None)
+        self.send(NO_TARGET)
 
     def measure(self, X_WE):
         self.system.GetInputPort("pose_measured").FixValue(self.context, X_WE)
