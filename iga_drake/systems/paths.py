@@ -18,6 +18,8 @@ from iga_drake.systems.inverse_kinematics import PoseSolver
 from iga_drake.systems.planning_robot import PlanningRobot
 
 _LINE_STEP = (0.02, 0.1)  # m, rad between two poses that are tried on the line
+_MARGIN, _MARGIN_LONG = 0.03, 0.15  # rad kept from the joints' limits on the line
+_LONG = (0.15, 0.7)  # m, rad from which on a line counts as long
 _JOINT_STEP = 0.1  # rad between two postures that are checked for collisions
 _JUMP = 0.5  # rad that a joint may move between two poses on the line
 _JOINT_SPEED_SHARE = 0.5  # of the velocity limits, on a joint path
@@ -154,9 +156,12 @@ def plan_path(
 def can_follow(robot: PlanningRobot, q: np.ndarray, path: LinePath) -> bool:
     """Whether the arm at posture `q` (rad) can follow the line within limits, without jumps."""
     limits = robot.limits
-    margin = 0.03
-    lower, upper = limits.position_lower() + margin, limits.position_upper() - margin
     distance, angle = pose_error(path.X_WStart, path.X_WGoal)
+    # A long way or a wide turn that brushes a joint's limit ends folded against it more often than
+    # not; a short one is better kept straight.
+    long = distance > _LONG[0] or angle > _LONG[1]
+    margin = _MARGIN_LONG if long else _MARGIN
+    lower, upper = limits.position_lower() + margin, limits.position_upper() - margin
     count = int(np.ceil(max(distance / _LINE_STEP[0], angle / _LINE_STEP[1])))
     for step in range(1, count + 1):
         moved = _move_to(robot, q, path.pose(step / count), lower, upper, path.nominal)

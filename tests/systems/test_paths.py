@@ -88,3 +88,18 @@ def test_a_line_moves_the_nominal_posture_evenly_from_its_start():
     for share in (0.0, 0.25, 1.0):
         np.testing.assert_allclose(line.posture(share), share * nominal, atol=1e-12)
     assert LinePath(RigidTransform(), RigidTransform(), nominal).posture(0.0) is nominal
+
+
+def test_a_wide_turn_whose_short_way_ends_at_a_limit_goes_through_the_joints():
+    """From q7 = -1.42 to 2.59 rad the short way is -2.27 rad, beyond the joint's limit of -2.90."""
+    robot, solver = panda_robot(), panda_solver()
+    start, end = robot.home.copy(), robot.home.copy()
+    start[6], end[6] = -1.42, 2.59
+    X_WGoal = robot.pose(end)
+    path = plan_path(solver, q=start, X_WStart=robot.pose(start), X_WGoal=X_WGoal)
+    assert isinstance(path, JointPath)
+    assert max(pose_error(path.pose(1.0), X_WGoal)) < 2e-3
+    lower, upper = robot.limits.position_lower(), robot.limits.position_upper()
+    for share in np.linspace(0, 1, 21):
+        posture = path.posture(share)
+        assert (posture > lower).all() and (posture < upper).all()
