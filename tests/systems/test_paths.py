@@ -91,10 +91,10 @@ def test_a_line_moves_the_nominal_posture_evenly_from_its_start():
 
 
 def test_a_wide_turn_whose_short_way_ends_at_a_limit_goes_through_the_joints():
-    """From q7 = -1.42 to 2.59 rad the short way is -2.27 rad, beyond the joint's limit of -2.90."""
+    """From q7 = -2 to 2 rad the short way is -2.28 rad, far beyond the joint's limit of -2.90."""
     robot, solver = panda_robot(), panda_solver()
     start, end = robot.home.copy(), robot.home.copy()
-    start[6], end[6] = -1.42, 2.59
+    start[6], end[6] = -2.0, 2.0
     X_WGoal = robot.pose(end)
     path = plan_path(solver, q=start, X_WStart=robot.pose(start), X_WGoal=X_WGoal)
     assert isinstance(path, JointPath)
