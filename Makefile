@@ -3,7 +3,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# The CPU build that this release was tested with; a newer Python gets the newest torch.
+# The release that this was tested with; where pip would fetch CUDA with it, name a CPU build:
+# make TORCH=... (a version or a wheel). A newer Python gets the newest torch.
 TORCH ?= torch==2.13.0
 EXTRAS := icp,visuals,notebook,dev
 # Some releases add t64 to a package's name.
