@@ -1,4 +1,4 @@
-"""The order of the package: imports point only upwards in ARCHITECTURE's table."""
+"""The order of the package: imports point only towards the data's source."""
 
 import ast
 import subprocess

@@ -1,4 +1,4 @@
-"""Alignment error of an aligner on generated samples (METHOD: context of 4, one test pair).
+"""Alignment error of an aligner on generated samples (a context of four, one test pair).
 
 The test pair's grasped cloud starts at a Haar-random pose. Translation error: distance that the
 centroid of the grasped cloud ends from where it belongs; rotation error: geodesic angle.

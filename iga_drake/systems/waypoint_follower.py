@@ -133,11 +133,6 @@ class WaypointFollower(LeafSystem):
             "status", lambda: Value[object](FollowerStatus()), self._calc_status, ticket
         )
 
-    def set_initial_opening(self, context: Context, opening: float) -> None:
-        """Sets the opening (m) commanded before the first target, in this system's context."""
-        motion = context.get_abstract_state(int(self._motion)).get_value()
-        context.SetAbstractState(int(self._motion), replace(motion, opening=float(opening)))
-
     def _update(self, context: Context, state: State) -> EventStatus:
         motion: _Motion = context.get_abstract_state(int(self._motion)).get_value()
         X_WE = RigidTransform(self._pose_input.Eval(context))  # a copy: Eval refers to the cache

@@ -37,8 +37,11 @@ def default_weights() -> Path:
 
 
 class IgaAligner:
-    """`Aligner` by dense SE(3)-invariant correspondence and consistency voting (METHOD: paper's
-    energy is replaced by the agreement of closed-form proposals over the demonstrations)."""
+    """`Aligner` by dense SE(3)-invariant correspondence and consistency voting.
+
+    In place of the paper's learned energy stands the agreement of closed-form proposals over the
+    demonstrations.
+    """
 
     name = "iga"
 
