@@ -146,16 +146,40 @@ def _demonstrate(arguments: argparse.Namespace) -> int:
 # view
 
 
+# what is looked at: module, its function that adds options, its function that shows
+VIEWS = {
+    "demonstrations": ("iga_drake.cli", "_add_view_demonstrations", "_view_demonstrations"),
+    "shapes": ("iga_drake.evaluation.shape_sheets", "add_view_shapes", "view_shapes"),
+    "dataset": ("iga_drake.evaluation.dataset_views", "add_view_dataset", "view_dataset"),
+    "deformations": (
+        "iga_drake.evaluation.deformations",
+        "add_view_deformations",
+        "view_deformations",
+    ),
+}
+
+
 def _add_view(parser: argparse.ArgumentParser) -> None:
-    kinds = parser.add_subparsers(dest="kind", required=True)
-    demonstrations = kinds.add_parser("demonstrations", help="clouds and waypoints in 3D")
-    demonstrations.add_argument("folder", type=Path)
-    demonstrations.add_argument(
+    parser.add_argument("what", choices=VIEWS)
+
+
+def _view(arguments: argparse.Namespace) -> int:
+    name, add, show = VIEWS[arguments.what]
+    module = _delegate(name)
+    parser = argparse.ArgumentParser(prog=f"iga view {arguments.what}")
+    getattr(module, add)(parser)
+    return int(getattr(module, show)(parser.parse_args(arguments.options)) or SUCCESS)
+
+
+def _add_view_demonstrations(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Clouds and waypoints in 3D."
+    parser.add_argument("folder", type=Path)
+    parser.add_argument(
         "--html", type=Path, metavar="OUT", help="write a page instead of serving one"
     )
 
 
-def _view(arguments: argparse.Namespace) -> int:
+def _view_demonstrations(arguments: argparse.Namespace) -> int:
     from iga_drake.aligners.demonstration import read_demonstrations
     from iga_drake.evaluation.replay import demonstrations_html, serve_demonstrations
 
@@ -194,9 +218,13 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     tasks.add_argument("--results", type=Path, help="results file to append to and to go on from")
     tasks.add_argument("--json", action="store_true", help="print the summary as JSON")
     alignment = kinds.add_parser("alignment", help="pose error on generated samples")
-    alignment.add_argument("--aligner", type=_names, default=["iga", "icp"])
-    alignment.add_argument("--splits", type=_names, default=["validation", "unseen_categories"])
-    alignment.add_argument("--count", type=int, default=100, help="samples of each split")
+    alignment.add_argument(
+        "--aligner", type=_names, default=["iga", "icp", "oracle"], help="names, or oracle"
+    )
+    alignment.add_argument("--sets", type=_names, help="of samples (default: the paper's five)")
+    alignment.add_argument("--count", type=int, default=100, help="samples of each set")
+    alignment.add_argument("--results", type=Path, help="results file to append to and go on from")
+    alignment.add_argument("--by-category", action="store_true", help="also by kind of object")
     alignment.add_argument("--weights", type=Path, help="weights of iga (default: the landed ones)")
     alignment.add_argument("--card", type=Path, help="write a model card of iga's weights")
     alignment.add_argument("--json", action="store_true", help="print the errors as JSON")
@@ -211,22 +239,42 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 def _evaluate_alignment(arguments: argparse.Namespace) -> int:
     from iga_drake.aligners.iga.aligner import default_weights
     from iga_drake.aligners.registry import make_aligner
-    from iga_drake.evaluation.alignment import HEADER, evaluate_alignment, model_card
+    from iga_drake.evaluation.alignment import (
+        FIVE_SETS,
+        HEADER,
+        ORACLE,
+        by_category,
+        digest,
+        evaluate_alignment,
+        model_card,
+    )
 
-    rows = []
+    weights = arguments.weights or default_weights()
+    summaries = []
     if not arguments.json:
         print(HEADER)
     for name in arguments.aligner:
-        options = {"weights": arguments.weights} if name == "iga" else {}
-        aligner = make_aligner(name, **options)
-        for split in arguments.splits:
-            rows.append(evaluate_alignment(aligner, split, arguments.count))
+        options = {"weights": weights} if name == "iga" else {}
+        aligner = None if name == ORACLE else make_aligner(name, **options)
+        rows = []
+        for chosen in arguments.sets or FIVE_SETS:
+            summary, found = evaluate_alignment(
+                aligner,
+                chosen,
+                arguments.count,
+                results=arguments.results,
+                version=digest(weights) if name == "iga" else "",
+            )
+            summaries.append(summary)
+            rows += found
             if not arguments.json:
-                print(rows[-1].row(), flush=True)
+                print(summary.rows(), flush=True)
+        if arguments.by_category and not arguments.json:
+            print(by_category(rows))
     if arguments.json:
-        print(json.dumps([asdict(row) for row in rows], indent=2))
+        print(json.dumps([asdict(summary) for summary in summaries], indent=2))
     if arguments.card:
-        write_text(arguments.card, model_card(arguments.weights or default_weights(), rows))
+        write_text(arguments.card, model_card(weights, summaries))
     return SUCCESS
 
 
@@ -272,8 +320,8 @@ def _evaluate_tasks(arguments: argparse.Namespace) -> int:
 # benchmark and train: modules with `main(argv) -> int`, or `add_arguments(parser)` and
 # `main(arguments) -> int`
 
-DELEGATES = ("benchmark", "train")
-BENCHMARKS = ("fusion", "inference", "ik")
+DELEGATES = ("benchmark", "dataset", "shapes", "train", "view")
+BENCHMARKS = ("data", "fusion", "inference", "ik")
 
 
 def _delegate(module: str) -> Any:
@@ -294,13 +342,23 @@ def _benchmark(arguments: argparse.Namespace) -> int:
     return _run_delegate(module, f"iga benchmark {arguments.what}", arguments.options)
 
 
-def _add_train(parser: argparse.ArgumentParser) -> None:
-    pass  # every option belongs to the training command
+def _add_nothing(parser: argparse.ArgumentParser) -> None:
+    pass  # every option belongs to the module that runs
 
 
 def _train(arguments: argparse.Namespace) -> int:
     module = _delegate("iga_drake.training.cli")
     return _run_delegate(module, "iga train", arguments.options)
+
+
+def _dataset(arguments: argparse.Namespace) -> int:
+    module = _delegate("iga_drake.dataset.cli")
+    return _run_delegate(module, "iga dataset", arguments.options)
+
+
+def _shapes(arguments: argparse.Namespace) -> int:
+    module = _delegate("iga_drake.shapes.cli")
+    return _run_delegate(module, "iga shapes", arguments.options)
 
 
 def _run_delegate(module: Any, prog: str, options: Sequence[str]) -> int:
@@ -318,10 +376,12 @@ COMMANDS: dict[str, tuple[str, Callable[[Any], None], Callable[[Any], int]]] = {
         _add_demonstrate,
         _demonstrate,
     ),
-    "view": ("look at demonstrations", _add_view, _view),
+    "view": ("look at demonstrations, shapes, samples, deformations", _add_view, _view),
     "evaluate": ("success of whole tasks, errors of alignments", _add_evaluate, _evaluate),
     "benchmark": ("time a part", _add_benchmark, _benchmark),
-    "train": ("train the learned aligner", _add_train, _train),
+    "shapes": ("list families, write them as SDF, read meshes", _add_nothing, _shapes),
+    "dataset": ("write samples to files, print their digests", _add_nothing, _dataset),
+    "train": ("train the learned aligner", _add_nothing, _train),
 }
 
 

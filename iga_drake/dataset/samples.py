@@ -1,106 +1,299 @@
-"""Consistently aligned object pairs as a pure function of (split, index).
+"""Consistently aligned object pairs as a pure function of (set, index).
 
-One sample (paper, "Generalisation Through Shape Augmentation"): two categories, N deformed
-instances of each with known correspondence, aligned so that the neighbourhood of one point on each
-object keeps its relative pose, seen by three depth cameras. Every observed point carries its place
-on the canonical instance, in units of that instance's size.
+One sample (paper, "Generalisation Through Shape Augmentation"): two categories, N instances of
+each with known correspondence, aligned so that the neighbourhood of one point on each object keeps
+its relative pose, seen by three depth cameras. Every observed point carries its place on the
+canonical instance, in units of that instance's size.
+
+Frames: O, a shape's own; C, of the canonical pair (B as in its O); W, of one observed pair.
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
+import torch
 
-from iga_drake.dataset.depth_camera import depth_noise, visible_points
-from iga_drake.geometry.clouds import voxel_indices
+from iga_drake.dataset.depth_camera import Clouds, DepthNoise, observe
+from iga_drake.dataset.splits import SampleSet, family_names, sample_set
 from iga_drake.shapes.composite import CompositeCategory
-from iga_drake.shapes.deform import LatticeDeformer
-from iga_drake.shapes.families import FAMILIES, draw
+from iga_drake.shapes.deformers import DeformableShape, Deformer, LatticeDeformer, PartDeformer
+from iga_drake.shapes.families import FAMILIES
+from iga_drake.shapes.symmetry import NO_SYMMETRY, Symmetry
 
-# Seeds of the splits never meet: (split number, index) seeds the generator.
-SPLITS = {"train": 0, "validation": 1, "unseen_categories": 2}
-# Families that training never draws; "unseen_categories" draws only these.
-HELD_OUT_FAMILIES = ("teapot", "hammer", "shoe", "dustpan")
+COMPOSITE = "composite"
+CAMERAS = 3
+_DEFORMATIONS = ("none", "lattice", "parts", "dif_net")
+SIZE = (0.08, 0.35)  # m, of every instance
+CANONICAL_SIZE = (0.1, 0.3)  # m, log-uniform
 
 
 @dataclass(frozen=True)
 class SampleConfig:
-    """How samples are made."""
+    """How samples are made, whatever the set."""
 
-    alignments: int = 5  # N: demonstrations + 1
     surface_points: int = 2000
-    cloud_points: int = 256  # every observed cloud has this many (sampled with repetition if short)
+    cloud_points: int = 256  # every observed cloud has this many (repeated where fewer are seen)
     voxel: float = 0.005  # m
     neighbourhood: float = 0.2  # fraction of the surface that keeps its pose
-    composite_share: float = 0.45
-    free_form_share: float = 0.6
-    noise: bool = True
+    # Shares of the objects by deformation of their instances: none, lattice, part-wise, DIF-Net.
+    deformations: tuple[float, float, float, float] = (0.25, 0.35, 0.2, 0.2)
+    joint_share: float = 0.4  # of the samples: both objects in view hide parts of each other
+    least_seen: int = 64  # occupied voxels of a cloud
 
 
 @dataclass(frozen=True)
 class Sample:
-    """N aligned pairs. Arrays are float32; role 0 is the grasped object A, role 1 the target B."""
+    """N aligned pairs, the last one the test pair. Role 0 is the grasped object A, 1 the target B.
 
-    points: np.ndarray  # (2, N, P, 3) m, A and B of one alignment in one common frame
+    float32 unless said otherwise.
+    """
+
+    points: np.ndarray  # (2, N, P, 3) m, A and B of one pair in their common frame W
     canonical: np.ndarray  # (2, N, P, 3) place on the canonical instance, in units of its size
     aligned: np.ndarray  # (2, N, P) bool: in the neighbourhood that keeps its pose
     size: np.ndarray  # (2, N) m, largest extent of each instance
+    mode: np.ndarray  # (N,) int64, which of the modes each pair shows
+    # (M, 4, 4) float64: motions of the test pair's A, in W, to every valid alignment; first: none.
+    modes: np.ndarray
+    # (2, 2, 3) float64: of the test pair's A and B, in W: a point (m) and the direction of the axis
+    # about which its family is symmetric.
+    axes: np.ndarray
     category: tuple[str, str]
 
+    @property
+    def symmetries(self) -> tuple[Symmetry, Symmetry]:
+        """Of A's and B's families."""
+        return _symmetry(self.category[0]), _symmetry(self.category[1])
 
-def _instances(
-    rng: np.random.Generator, split: str, config: SampleConfig, count: int
-) -> tuple[str, np.ndarray, np.ndarray]:
-    """A category's name, vertices (count, V, 3) and faces (F, 3); instance 0 is canonical."""
-    held_out = split == "unseen_categories"
-    if not held_out and rng.random() < config.composite_share:
-        category = CompositeCategory.draw(rng)
-        spread = rng.uniform(0.02, 0.3)
-        meshes = [category.instance(rng, spread) for _ in range(count)]
-        name = "composite"
+
+@dataclass(frozen=True)
+class _Object:
+    """One role's instances; instance 0 is canonical, N the test pair's."""
+
+    category: str
+    points: np.ndarray  # (N + 1, S, 3) m, the same surface points on all
+    normals: np.ndarray  # (N + 1, S, 3)
+    spacing: np.ndarray  # (N + 1,) m between neighbouring points
+    axis: np.ndarray  # (2, 3) of the test instance: point and direction
+
+
+def make_sample(split: str, index: int, config: SampleConfig | None = None) -> Sample:
+    """Sample `index` of the set `split` of splits.yaml. Raises `SplitError` for an unknown set."""
+    config = config or SampleConfig()
+    chosen = sample_set(split)
+    k = _stream_index(chosen, index)
+    objects = [_instances(chosen, k, role, config) for role in range(2)]
+    modes = [_Alignment(chosen, k, mode, objects, config) for mode in range(chosen.modes)]
+    attempt = 0
+    while True:
+        sample = _observe(chosen, k, attempt, objects, modes, config)
+        if sample is not None:
+            return sample
+        attempt += 1
+
+
+def category_names(chosen: SampleSet, k: int) -> tuple[str, str]:
+    """Names of A's and B's categories at index k of the set's streams."""
+    return _category(chosen, k, 0)[0], _category(chosen, k, 1)[0]
+
+
+def _category(chosen: SampleSet, k: int, role: int) -> tuple[str, np.random.Generator]:
+    """The category's name and the generator that draws a composite's structure."""
+    rng = chosen.rng("categories", k, role)
+    if rng.random() < chosen.composite_share:
+        return COMPOSITE, rng
+    names = family_names(chosen.families)
+    return names[int(rng.integers(len(names)))], rng
+
+
+def _symmetry(category: str) -> Symmetry:
+    return NO_SYMMETRY if category == COMPOSITE else FAMILIES[category].symmetry
+
+
+@cache
+def _kept(name: str) -> list[int]:
+    """Stream indices found so far that a set without symmetric families keeps."""
+    return []
+
+
+def _stream_index(chosen: SampleSet, index: int) -> int:
+    """Where the set's streams hold sample `index`."""
+    if index < 0:
+        raise IndexError(f"sample {index} of '{chosen.name}': the first is 0")
+    if chosen.symmetric:
+        return index
+    kept = _kept(chosen.name)
+    k = kept[-1] + 1 if kept else 0
+    while len(kept) <= index:
+        symmetries = [_symmetry(name) for name in category_names(chosen, k)]
+        if all(s.is_trivial or not s.exact for s in symmetries):
+            kept.append(k)
+        k += 1
+    return kept[index]
+
+
+def _instances(chosen: SampleSet, k: int, role: int, config: SampleConfig) -> _Object:
+    """The canonical instance of a category and N instances around it."""
+    category, vertices, faces, axis = _meshes(chosen, k, role, config)
+    rng = chosen.rng("instances", k, role, chosen.pairs + 1)
+    return _Object(category, *surface_points(rng, vertices, faces, config.surface_points), axis)
+
+
+def _meshes(
+    chosen: SampleSet, k: int, role: int, config: SampleConfig
+) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
+    """The category, vertices (N + 1, V, 3) m of its instances, faces (F, 3), and the symmetry axis
+    (2, 3) of the test pair's instance."""
+    category, structure = _category(chosen, k, role)
+    base = chosen.rng("instances", k, role)
+    each = [chosen.rng("instances", k, role, n) for n in range(chosen.pairs + 1)]
+    levels = np.full(chosen.pairs + 1, base.uniform(*chosen.variation))
+    last = base.uniform(*(chosen.test_variation or chosen.variation))
+    if chosen.test_variation:
+        levels[-1] = last
+    levels[0] = 0.0
+    independent = base.random() < chosen.independent_share
+    deformation = _DEFORMATIONS[int(base.choice(len(_DEFORMATIONS), p=config.deformations))]
+    target = np.exp(base.uniform(*np.log(CANONICAL_SIZE)))
+    cells = int(base.integers(3, 5))
+    symmetry = _symmetry(category)
+    # Part-wise deformation starts from the same product; else the products differ too.
+    spreads = np.zeros_like(levels) if deformation == "parts" else levels
+    if category == COMPOSITE:
+        composite = CompositeCategory.draw(structure)
+        surfaces = [
+            composite.instance(rng, 0.28 * spread)
+            for rng, spread in zip(each, spreads, strict=True)
+        ]
     else:
-        names = [n for n in FAMILIES if (n in HELD_OUT_FAMILIES) == held_out]
-        name = str(rng.choice(names))
-        if rng.random() < 0.7:
-            meshes = [draw(name, rng) for _ in range(count)]
-        else:  # variations of one product: only the free-form deformation differs
-            meshes = [draw(name, rng)] * count
-    vertices = np.stack([mesh[0] for mesh in meshes])
-    faces = meshes[0][1]
-    if rng.random() < config.free_form_share or all(m is meshes[0] for m in meshes):
-        deformer = LatticeDeformer(
-            amplitude=rng.uniform(0.0, 0.09),
-            scale=rng.uniform(0.0, 0.22),
-            cells=int(rng.integers(3, 5)),
+        family = FAMILIES[category]
+        product = family.sample_parameters(base)
+        surfaces = []
+        for n, (rng, spread) in enumerate(zip(each, spreads, strict=True)):
+            parameters = product
+            if n and independent and deformation != "parts":
+                parameters = family.sample_parameters(rng)
+            elif spread:
+                parameters = family.vary_parameters(product, rng, 0.5 * spread)
+            surfaces.append(family.surface(parameters))
+    vertices, faces = np.stack([surface[0] for surface in surfaces]), surfaces[0][1]
+    rest = vertices[-1].copy()
+    same = DeformableShape(vertices[0], faces)
+    for n in range(1, len(vertices)):
+        shape = same if deformation == "parts" else DeformableShape(vertices[n], faces)
+        deformer = _deformer(deformation, levels[n], cells)
+        if deformer is not None:
+            vertices[n] = deformer.deform(shape, int(each[n].integers(1 << 31)))
+    # One factor for all: instances keep their sizes relative to the canonical one.
+    extent = np.ptp(vertices, axis=1).max(1)
+    factors = np.clip(target / extent[0] * extent, *SIZE) / extent
+    vertices = vertices * factors[:, None, None]
+    axis = np.stack((np.zeros(3), symmetry.direction))
+    if not symmetry.is_trivial:
+        axis = _carry_axis(axis, rest, vertices[-1])
+    return category, vertices, faces, axis
+
+
+def _deformer(kind: str, level: float, cells: int) -> Deformer | None:
+    """The deformer of a kind at a level of variation from 0 to 1."""
+    if kind == "lattice":
+        return LatticeDeformer(amplitude=0.08 * level, scale=0.2 * level, cells=cells)
+    if kind == "parts":
+        return PartDeformer(
+            scale=0.4 * level, bend=0.15 * level, taper=0.3 * level, common=0.15 * level
         )
-        vertices = np.stack([deformer.deform(v, int(rng.integers(1 << 31))) for v in vertices])
-    extent = np.ptp(vertices, axis=1).max(1)
-    vertices = vertices * (np.exp(rng.uniform(np.log(0.1), np.log(0.3))) / extent.mean())
-    extent = np.ptp(vertices, axis=1).max(1)
-    vertices *= (np.clip(extent, 0.08, 0.35) / extent)[:, None, None]
-    return name, vertices, faces
+    if kind == "dif_net":
+        from iga_drake.shapes.deformers.dif_net import DifNetDeformer
+
+        return DifNetDeformer(scale=1.5 * level, stretch=0.2 * level)
+    return None
 
 
-def _surface(
+def canonical_mesh(split: str, index: int, role: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) m and faces (F, 3) of a sample's canonical A (role 0) or B (role 1)."""
+    chosen = sample_set(split)
+    _, vertices, faces, _ = _meshes(chosen, _stream_index(chosen, index), role, SampleConfig())
+    return vertices[0], faces
+
+
+def _carry_axis(axis: np.ndarray, rest: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """An axis (2, 3) of `rest` (V, 3) where it best lies in the deformed `vertices` (V, 3)."""
+    scale = np.sqrt(vertices.var(0).sum() / rest.var(0).sum())
+    R, p = _rigid_fit(scale * rest, vertices)
+    return np.stack((scale * R @ axis[0] + p, R @ axis[1]))
+
+
+def surface_points(
     rng: np.random.Generator, vertices: np.ndarray, faces: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface points on every instance: positions and normals (N, count, 3)."""
-    corners = vertices[:, faces]  # (N, F, 3, 3)
-    normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
-    area = np.linalg.norm(normals, axis=-1)
-    share = area / area.sum(1, keepdims=True)
-    share = share.max(0) + 1e-12
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same surface points on all instances (n, V, 3): positions and normals (n, count, 3), and
+    the distance of neighbours (n,).
+
+    A face gets points by the largest share of area that it has on any instance.
+    """
+    corner = vertices[:, faces[:, 0]]
+    u, v = vertices[:, faces[:, 1]] - corner, vertices[:, faces[:, 2]] - corner
+    cross = np.stack(
+        (
+            u[..., 1] * v[..., 2] - u[..., 2] * v[..., 1],
+            u[..., 2] * v[..., 0] - u[..., 0] * v[..., 2],
+            u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0],
+        ),
+        -1,
+    )
+    area = np.sqrt(np.einsum("nfk,nfk->nf", cross, cross)) + 1e-15
+    total = area.sum(1)
+    share = (area / total[:, None]).max(0)
     cumulative = np.cumsum(share / share.sum())
     face = np.searchsorted(cumulative, (np.arange(count) + rng.random(count)) / count)
     face = np.minimum(face, len(faces) - 1)
-    u, v = np.sqrt(rng.random(count)), rng.random(count)
-    weights = np.stack((1 - u, u * (1 - v), u * v), 1)
-    chosen = corners[:, face]  # (N, count, 3 corners, 3)
-    points = sum(weights[:, k, None] * chosen[:, :, k] for k in range(3))
-    normals = normals[:, face] / (area[:, face, None] + 1e-12)
-    return points, normals
+    a, b = np.sqrt(rng.random(count)), rng.random(count)
+    points = corner[:, face] + (a * (1 - b))[:, None] * u[:, face] + (a * b)[:, None] * v[:, face]
+    return points, cross[:, face] / area[:, face, None], np.sqrt(total / 2 / count)
+
+
+class _Alignment:
+    """One way in which A and B belong together: poses of all instances in the canonical frame C."""
+
+    def __init__(
+        self,
+        chosen: SampleSet,
+        k: int,
+        mode: int,
+        objects: list[_Object],
+        config: SampleConfig,
+    ):
+        rng = chosen.rng("alignments", k, mode)
+        self.near = []  # of each role (S,) bool: the neighbourhood that keeps its pose
+        self.poses = []  # of each role R (N, 3, 3), p (N, 3): an instance's own frame to C
+        picks = []
+        for shape in objects:
+            canonical = shape.points[0]
+            pick = int(rng.integers(len(canonical)))
+            distance = np.linalg.norm(canonical - canonical[pick], axis=1)
+            near = distance <= np.quantile(distance, config.neighbourhood)
+            self.near.append(near)
+            self.poses.append(_rigid_fit(shape.points[1:, near], canonical[near]))
+            picks.append(pick)
+        R, p = _relative_pose(rng, objects, picks)
+        RA, pA = self.poses[0]
+        self.poses[0] = (R @ RA, pA @ R.T + p)
+
+
+def _rigid_fit(source: np.ndarray, destination: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """R (..., 3, 3), p (..., 3) that carry source (..., n, 3) to destination (Kabsch 1976)."""
+    source_mean = source.mean(-2, keepdims=True)
+    mean = destination.mean(-2, keepdims=True)
+    U, _, Vt = np.linalg.svd(np.swapaxes(destination - mean, -1, -2) @ (source - source_mean))
+    flip = np.ones(U.shape[:-1])
+    flip[..., 2] = np.sign(np.linalg.det(U @ Vt))
+    R = (U * flip[..., None, :]) @ Vt
+    return R, (mean - source_mean @ np.swapaxes(R, -1, -2))[..., 0, :]
 
 
 def _rotation(rng: np.random.Generator) -> np.ndarray:
+    """A Haar-uniform rotation (3, 3), from a unit quaternion."""
     q = rng.normal(size=4)
     w, x, y, z = q / np.linalg.norm(q)
     return np.array(
@@ -112,136 +305,155 @@ def _rotation(rng: np.random.Generator) -> np.ndarray:
     )
 
 
-def _kabsch(source: np.ndarray, destination: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    ms, md = source.mean(0), destination.mean(0)
-    U, _, Vt = np.linalg.svd((destination - md).T @ (source - ms))
-    R = U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    return R, md - R @ ms
-
-
 def _aim(z: np.ndarray) -> np.ndarray:
+    """A rotation (3, 3) whose z axis is the unit vector z."""
     helper = np.array([1.0, 0, 0]) if abs(z[0]) < 0.7 else np.array([0, 1.0, 0])
     x = np.cross(helper, z)
     x /= np.linalg.norm(x)
     return np.column_stack((x, np.cross(z, x), z))
 
 
+def _turn(vector: np.ndarray) -> np.ndarray:
+    """The rotation (3, 3) by a rotation vector (Rodrigues)."""
+    angle = np.linalg.norm(vector)
+    x, y, z = vector / max(float(angle), 1e-12)
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
 def _relative_pose(
-    rng: np.random.Generator, points: list[np.ndarray], normals: list[np.ndarray], pick: list[int]
+    rng: np.random.Generator, objects: list[_Object], picks: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of A's canonical instance in B's: in contact at the picked points, near, or anywhere."""
-    if rng.random() < 0.6:  # the picked points face each other
-        RB = _aim(normals[1][pick[1]])
-        RA = _aim(-normals[0][pick[0]])
+    """Pose of A's canonical instance in B's: the picked points in contact or near each other and
+    facing, or at any angle and apart."""
+    (a, na), (b, nb) = (
+        (shape.points[0, pick], shape.normals[0, pick])
+        for shape, pick in zip(objects, picks, strict=True)
+    )
+    if rng.random() < 0.6:
         spin, lean = rng.uniform(0, 2 * np.pi), rng.normal(size=3) * 0.4
-        c, s = np.cos(spin), np.sin(spin)
-        R = RB @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ RA.T
-        angle = np.linalg.norm(lean)
-        k = lean / angle
-        K = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
-        R = (np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K) @ R
-        gap = rng.uniform(0, 0.04)
-        place = points[1][pick[1]] + normals[1][pick[1]] * gap
-        return R, place - R @ points[0][pick[0]]
+        R = _turn(lean) @ _aim(nb) @ _turn(np.array([0, 0, spin])) @ _aim(-na).T
+        return R, b + nb * rng.uniform(0, 0.04) - R @ a
     R = _rotation(rng)
-    return R, points[1][pick[1]] - R @ points[0][pick[0]] + rng.normal(size=3) * 0.06
+    return R, b - R @ a + rng.normal(size=3) * 0.06
+
+
+def camera_positions(rng: np.random.Generator, centres: np.ndarray) -> np.ndarray:
+    """Positions (n, CAMERAS, 3) m around centres (n, 3), spread about a random upright each."""
+    n = len(centres)
+    uprights = np.stack([_aim(v / np.linalg.norm(v)) for v in rng.normal(size=(n, 3))])
+    azimuth = rng.uniform(0, 2 * np.pi, (n, 1)) + 2 * np.pi / CAMERAS * np.arange(CAMERAS)
+    azimuth = azimuth + rng.normal(size=azimuth.shape) * 0.35
+    elevation = np.deg2rad(rng.uniform(15, 65, azimuth.shape))
+    level = np.cos(elevation)
+    rays = np.stack((np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation)), -1)
+    rays = rays * rng.uniform(0.6, 1.0, azimuth.shape)[..., None]
+    return centres[:, None] + rays @ np.swapaxes(uprights, -1, -2)
 
 
 def _observe(
+    chosen: SampleSet,
+    k: int,
+    attempt: int,
+    objects: list[_Object],
+    alignments: list[_Alignment],
+    config: SampleConfig,
+) -> Sample | None:
+    """The pairs as cameras see them; None where too little of an object is seen.
+
+    After a failed attempt the objects are seen one at a time.
+    """
+    rng = chosen.rng("views", k, attempt)
+    N = chosen.pairs
+    mode = np.arange(N) % len(alignments)  # as many demonstrations of each mode as can be
+    mode[:-1] = rng.permutation(mode[:-1])
+    mode[-1] = rng.integers(len(alignments))
+    joint = rng.random() < config.joint_share and attempt == 0
+    G, g = np.stack([_rotation(rng) for _ in range(N)]), rng.normal(size=(N, 3)) * 0.2
+    points = np.empty((N, 2, config.surface_points, 3))
+    normals = np.empty_like(points)
+    near = np.empty((2, N, config.surface_points), bool)
+    poses = np.empty((2, N, 4, 4))
+    for role, shape in enumerate(objects):
+        R = np.stack([alignments[m].poses[role][0][n] for n, m in enumerate(mode)])
+        p = np.stack([alignments[m].poses[role][1][n] for n, m in enumerate(mode)])
+        R, p = G @ R, np.einsum("nij,nj->ni", G, p) + g
+        poses[role] = _pose(R, p)
+        points[:, role] = shape.points[1:] @ np.swapaxes(R, -1, -2) + p[:, None]
+        normals[:, role] = shape.normals[1:] @ np.swapaxes(R, -1, -2)
+        near[role] = np.stack([alignments[m].near[role] for m in mode])
+    spacing = np.stack([shape.spacing[1:] for shape in objects], 1)  # (N, 2)
+    clouds = _look(rng, points, normals, spacing, joint, chosen.noise, config)
+    if int(clouds.distinct.min()) < config.least_seen:
+        return None
+    index = clouds.index.numpy().transpose(1, 0, 2)  # (2, N, P)
+    canonical = [shape.points[0] / np.ptp(shape.points[0], axis=0).max() for shape in objects]
+    test_A, test_B = poses[:, -1]
+    return Sample(
+        points=np.ascontiguousarray(clouds.points.numpy().transpose(1, 0, 2, 3)),
+        canonical=np.stack([canonical[role][index[role]] for role in range(2)]).astype(np.float32),
+        aligned=np.take_along_axis(near, index, 2),
+        size=np.stack([np.ptp(s.points[1:], axis=1).max(1) for s in objects]).astype(np.float32),
+        mode=mode,
+        modes=_modes(alignments, int(mode[-1]), test_A, test_B),
+        axes=np.stack([_move_axis(poses[role, -1], objects[role].axis) for role in range(2)]),
+        category=(objects[0].category, objects[1].category),
+    )
+
+
+def _look(
     rng: np.random.Generator,
     points: np.ndarray,
     normals: np.ndarray,
-    others: tuple[np.ndarray, np.ndarray] | None,
+    spacing: np.ndarray,
+    joint: bool,
+    noise: bool,
     config: SampleConfig,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Observed positions (P, 3) and the indices (P,) of the surface points that they come from."""
-    up = _rotation(rng)[:, 2]
-    frame = _aim(up)
-    azimuth = rng.uniform(0, 2 * np.pi)
-    centre = points.mean(0)
-    everything, everynormal = points, normals
-    if others is not None:
-        everything = np.concatenate((points, others[0]))
-        everynormal = np.concatenate((normals, others[1]))
-    found, seen = [], []
-    for k in range(3):
-        a = azimuth + 2 * np.pi / 3 * k + rng.normal() * 0.35
-        elevation = np.deg2rad(rng.uniform(15, 65))
-        direction = frame @ np.array(
-            [np.cos(a) * np.cos(elevation), np.sin(a) * np.cos(elevation), np.sin(elevation)]
-        )
-        camera = centre + direction * rng.uniform(0.6, 1.0)
-        mask = visible_points(everything, everynormal, camera, cell=0.011, tolerance=0.012)
-        index = np.flatnonzero(mask[: len(points)])
-        cloud = points[index]
-        if config.noise and len(index):
-            ray = cloud - camera
-            depth = np.linalg.norm(ray, axis=1, keepdims=True)
-            cloud = cloud + ray / depth * depth_noise(depth) * rng.normal(size=(len(index), 1))
-            cloud = cloud + rng.normal(size=3) * 0.002
-        found.append(cloud)
-        seen.append(index)
-    cloud, index = np.concatenate(found), np.concatenate(seen)
-    order = rng.permutation(len(index))
-    keep = order[voxel_indices(cloud[order], config.voxel)] if len(index) else order
-    return cloud[keep], index[keep]
-
-
-def make_sample(split: str, index: int, config: SampleConfig | None = None) -> Sample:
-    """Sample `index` of `split` ("train", "validation", "unseen_categories"); seeded, pure."""
-    config = config or SampleConfig()
-    rng = np.random.default_rng([SPLITS[split], index])
-    while True:
-        sample = _try_sample(rng, split, config)
-        if sample is not None:
-            return sample
-
-
-def _try_sample(rng: np.random.Generator, split: str, config: SampleConfig) -> Sample | None:
-    N, P = config.alignments, config.cloud_points
-    names, clouds, normals, canonical, near, sizes, picks = [], [], [], [], [], [], []
-    for _ in range(2):
-        name, vertices, faces = _instances(rng, split, config, N + 1)
-        points, normal = _surface(rng, vertices, faces, config.surface_points)
-        size = np.ptp(points[0], axis=0).max()
-        pick = int(rng.integers(config.surface_points))
-        distance = np.linalg.norm(points[0] - points[0][pick], axis=1)
-        near.append(distance <= np.quantile(distance, config.neighbourhood))
-        names.append(name)
-        clouds.append(points)
-        normals.append(normal)
-        canonical.append(points[0] / size)
-        sizes.append(np.ptp(points[1:], axis=1).max(1))
-        picks.append(pick)
-    R_BA, p_BA = _relative_pose(rng, [c[0] for c in clouds], [n[0] for n in normals], picks)
-    joint = rng.random() < 0.4  # both objects seen together: they hide parts of each other
-    out_points = np.empty((2, N, P, 3), np.float32)
-    out_canonical = np.empty((2, N, P, 3), np.float32)
-    out_near = np.empty((2, N, P), bool)
-    for n in range(N):
-        moved, turned = [], []
-        for role in range(2):
-            R, p = _kabsch(clouds[role][n + 1][near[role]], clouds[role][0][near[role]])
-            x, v = clouds[role][n + 1] @ R.T + p, normals[role][n + 1] @ R.T
-            if role == 0:
-                x, v = x @ R_BA.T + p_BA, v @ R_BA.T
-            moved.append(x)
-            turned.append(v)
-        G, g = _rotation(rng), rng.normal(size=3) * 0.2
-        for role in range(2):
-            others = (moved[1 - role], turned[1 - role]) if joint else None
-            cloud, index = _observe(rng, moved[role], turned[role], others, config)
-            if len(index) < 64:
-                return None
-            chosen = rng.permutation(len(index))[:P]
-            chosen = np.concatenate((chosen, rng.choice(len(index), P - len(chosen))))
-            out_points[role, n] = cloud[chosen] @ G.T + g
-            out_canonical[role, n] = canonical[role][index[chosen]]
-            out_near[role, n] = near[role][index[chosen]]
-    return Sample(
-        points=out_points,
-        canonical=out_canonical,
-        aligned=out_near,
-        size=np.stack(sizes).astype(np.float32),
-        category=(names[0], names[1]),
+) -> Clouds:
+    """Observed clouds (N, 2, ...) of surface points and normals (N, 2, S, 3)."""
+    N, S = len(points), points.shape[2]
+    if joint:  # one rig about both
+        cameras = camera_positions(rng, points.mean((1, 2)))
+    else:
+        points, normals = points.reshape(2 * N, 1, S, 3), normals.reshape(2 * N, 1, S, 3)
+        spacing = spacing.reshape(2 * N, 1)
+        cameras = camera_positions(rng, points.mean((1, 2)))
+    clouds = observe(
+        *(torch.from_numpy(a.astype(np.float32)) for a in (points, normals, cameras)),
+        spacing=torch.from_numpy(spacing.astype(np.float32)),
+        voxel=config.voxel,
+        count=config.cloud_points,
+        noise=DepthNoise() if noise else None,
+        generator=torch.Generator().manual_seed(int(rng.integers(1 << 62))),
     )
+    P = config.cloud_points
+    return Clouds(
+        points=clouds.points.reshape(N, 2, P, 3),
+        index=clouds.index.reshape(N, 2, P),
+        distinct=clouds.distinct.reshape(N, 2),
+    )
+
+
+def _pose(R: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """(..., 4, 4)"""
+    X = np.zeros((*R.shape[:-2], 4, 4))
+    X[..., :3, :3], X[..., :3, 3], X[..., 3, 3] = R, p, 1.0
+    return X
+
+
+def _modes(
+    alignments: list[_Alignment], shown: int, X_WA: np.ndarray, X_WB: np.ndarray
+) -> np.ndarray:
+    """(M, 4, 4) motions in W of the test pair's A from the shown mode to each, B held still."""
+    motions = []
+    for m in [shown] + [m for m in range(len(alignments)) if m != shown]:
+        (RA, pA), (RB, pB) = alignments[m].poses
+        X_CA, X_CB = _pose(RA[-1], pA[-1]), _pose(RB[-1], pB[-1])
+        motions.append(X_WB @ np.linalg.inv(X_CB) @ X_CA @ np.linalg.inv(X_WA))
+    motions[0] = np.eye(4)
+    return np.stack(motions)
+
+
+def _move_axis(X: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """An axis (2, 3), point and direction, moved by X (4, 4)."""
+    return np.stack((X[:3, :3] @ axis[0] + X[:3, 3], X[:3, :3] @ axis[1]))

@@ -1,33 +1,66 @@
-"""Alignment error of an aligner on generated samples (a context of four, one test pair).
+"""Alignment error of an aligner on the evaluation sets (a context of four, one test pair).
 
 The test pair's grasped cloud starts at a Haar-random pose. Translation error: distance that the
-centroid of the grasped cloud ends from where it belongs; rotation error: geodesic angle.
+centroid of the grasped cloud ends from where it belongs; rotation error: geodesic angle. Where the
+demonstrations show several alignments, the nearest one counts. Two kinds of error are reported:
+
+- plain: against the alignments as generated;
+- modulo symmetry: where A's or B's family is (nearly) symmetric, against the nearest of the
+  alignments that are the same up to the symmetry.
 """
 
+import json
 import time
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from iga_drake.aligners.checkpoint import load_checkpoint
+from iga_drake.checkpoint import load_checkpoint
 from iga_drake.aligners.iga.weights import DESCRIPTOR
 from iga_drake.aligners.protocol import Aligner, Alignment
-from iga_drake.dataset.samples import make_sample
+from iga_drake.dataset.oracle import oracle_pose
+from iga_drake.dataset.samples import Sample, SampleConfig, make_sample
+from iga_drake.dataset.splits import sample_sets
 from iga_drake.errors import IgaDrakeError
+from iga_drake.shapes.symmetry import Symmetry
 
-SPLITS = ("validation", "unseen_categories")
+FIVE_SETS = (
+    "seen_alignments",
+    "unseen_alignments",
+    "unseen_instances",
+    "unseen_categories",
+    "multi_modal",
+)
+ORACLE = "oracle"
 THRESHOLDS = ((0.01, 5.0), (0.02, 10.0), (0.03, 15.0))  # m, deg
+# Observed clouds of the evaluation sets are denser than those of training.
+CONFIG = SampleConfig(cloud_points=512)
 
 
 @dataclass(frozen=True)
-class AlignmentErrors:
-    """Errors over `count` samples of a split; lengths in cm, angles in degrees."""
+class SampleErrors:
+    """Errors of one sample; m and rad. `None` where the oracle has no answer."""
 
-    split: str
     aligner: str
-    count: int
+    split: str
+    index: int
+    grasped: str  # category
+    target: str
+    translation: float
+    rotation: float
+    translation_modulo: float  # modulo symmetry
+    rotation_modulo: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Over many samples; cm and degrees."""
+
     translation_mean: float
     translation_std: float
     translation_median: float
@@ -35,30 +68,60 @@ class AlignmentErrors:
     rotation_std: float
     rotation_median: float
     success: tuple[float, ...]  # share within each of THRESHOLDS
-    seconds_median: float
 
-    def row(self) -> str:
-        """One line of the table."""
+    @staticmethod
+    def of(translation: np.ndarray, rotation: np.ndarray) -> "Errors":
+        """translation (n,) m, rotation (n,) rad."""
+        cm, deg = 100 * translation, np.degrees(rotation)
+        return Errors(
+            float(cm.mean()),
+            float(cm.std()),
+            float(np.median(cm)),
+            float(deg.mean()),
+            float(deg.std()),
+            float(np.median(deg)),
+            tuple(float(((cm <= 100 * m) & (deg <= d)).mean()) for m, d in THRESHOLDS),
+        )
+
+    def columns(self) -> str:
+        """Part of a row of the table."""
         rates = "  ".join(f"{100 * rate:5.1f}" for rate in self.success)
         return (
-            f"{self.aligner:<10} {self.split:<18} {self.count:>5}  "
-            f"{self.translation_mean:5.2f} ± {self.translation_std:4.2f} "
-            f"({self.translation_median:4.2f})  "
-            f"{self.rotation_mean:5.1f} ± {self.rotation_std:4.1f} ({self.rotation_median:4.1f})  "
-            f"{rates}  {self.seconds_median:6.2f}"
+            f"{self.translation_mean:5.2f} ± {self.translation_std:5.2f} "
+            f"({self.translation_median:5.2f})  "
+            f"{self.rotation_mean:5.1f} ± {self.rotation_std:4.1f} ({self.rotation_median:5.1f})  "
+            f"{rates}"
+        )
+
+
+@dataclass(frozen=True)
+class AlignmentErrors:
+    """Errors of an aligner over `count` samples of a set."""
+
+    split: str
+    aligner: str
+    count: int
+    plain: Errors
+    modulo: Errors  # modulo symmetry
+    seconds_median: float
+
+    def rows(self) -> str:
+        """Two lines of the table."""
+        first = f"{self.aligner:<8} {self.split:<18} {self.count:>5}"
+        return (
+            f"{first}  plain   {self.plain.columns()}  {self.seconds_median:6.2f}\n"
+            f"{'':<33}  modulo  {self.modulo.columns()}"
         )
 
 
 HEADER = (
-    f"{'aligner':<10} {'split':<18} {'count':>5}  {'cm mean ± std (median)':<20}  "
-    f"{'deg mean ± std (median)':<20}  % within 1 cm 5°, 2 cm 10°, 3 cm 15°  s"
+    f"{'aligner':<8} {'set':<18} {'count':>5}  {'error':<6}  {'cm mean ± std (median)':<21}  "
+    f"{'deg mean ± std (median)':<20}  % in 1 cm 5°, 2 cm 10°, 3 cm 15°   s"
 )
 
 
 def random_pose(index: int) -> np.ndarray:
     """A Haar-random start pose (4, 4), the same for every aligner."""
-    from scipy.spatial.transform import Rotation
-
     rng = np.random.default_rng([7, index])
     X = np.eye(4)
     X[:3, :3] = Rotation.random(rng=rng).as_matrix()
@@ -74,37 +137,171 @@ def pose_errors(estimate: np.ndarray, truth: np.ndarray, cloud: np.ndarray) -> t
     return float(np.linalg.norm((estimate - truth) @ centre)), float(np.arccos(cosine))
 
 
-def evaluate_alignment(aligner: Aligner, split: str, count: int) -> AlignmentErrors:
-    """Aligns the first `count` samples of a split. Same samples and starts for every aligner."""
-    if split not in SPLITS:
-        raise IgaDrakeError(f"split '{split}' is not known; one of: {', '.join(SPLITS)}")
-    if count < 1:
-        raise IgaDrakeError(f"count {count}: at least 1 sample is needed")
-    rows, seconds = [], []
-    for index in range(count):
-        sample = make_sample(split, index)
-        N = sample.points.shape[1]
+def equivalents(sample: Sample, *, symmetry: bool) -> np.ndarray:
+    """(n, 4, 4) motions in W of the test pair's A that end in a valid alignment; with `symmetry`
+    also those that differ by the families' symmetries."""
+    motions = sample.modes
+    if not symmetry:
+        return motions
+    of_A, of_B = (
+        _turns(group, axis) for group, axis in zip(sample.symmetries, sample.axes, strict=True)
+    )
+    # B's symmetry turns what stands around it; A's turns A in its place.
+    motions = motions[:, None] @ of_A[None]
+    return (of_B[:, None, None] @ motions[None]).reshape(-1, 4, 4)
+
+
+def _turns(group: Symmetry, axis: np.ndarray) -> np.ndarray:
+    """(n, 4, 4) the group's rotations about an axis (2, 3), point and direction."""
+    point, direction = axis
+    X = np.tile(np.eye(4), (len(group.angles()), 1, 1))
+    X[:, :3, :3] = Rotation.from_rotvec(group.angles()[:, None] * direction).as_matrix()
+    X[:, :3, 3] = point - X[:, :3, :3] @ point
+    return X
+
+
+def nearest_error(motion: np.ndarray, valid: np.ndarray, cloud: np.ndarray) -> tuple[float, float]:
+    """Errors (m, rad) of a motion (4, 4) of a cloud (P, 3) against the one of `valid` (n, 4, 4)
+    that puts the cloud's points nearest to where the motion puts them."""
+    few = cloud[:: max(1, len(cloud) // 32)].astype(np.float64)
+    ends = few @ np.swapaxes(valid[:, :3, :3], 1, 2) + valid[:, None, :3, 3]
+    off = ends - (few @ motion[:3, :3].T + motion[:3, 3])
+    best = int(np.square(off).sum((1, 2)).argmin())
+    return pose_errors(motion, valid[best], cloud)
+
+
+def evaluate_sample(aligner: Aligner | None, split: str, index: int) -> SampleErrors | None:
+    """Aligns one sample; without an aligner the oracle answers, or not (None)."""
+    sample = make_sample(split, index, CONFIG)
+    N = sample.points.shape[1]
+    test = sample.points[0, -1]
+    began = time.perf_counter()
+    if aligner is None:
+        motion = oracle_pose(sample)
+        if motion is None:
+            return None
+    else:
         context = tuple(Alignment(sample.points[0, n], sample.points[1, n]) for n in range(N - 1))
         start = random_pose(index)
-        grasped = sample.points[0, -1] @ start[:3, :3].T + start[:3, 3]
+        grasped = test @ start[:3, :3].T + start[:3, 3]
         began = time.perf_counter()
         estimate = aligner.align(context, grasped, sample.points[1, -1], seed=index)
-        seconds.append(time.perf_counter() - began)
-        rows.append(pose_errors(estimate.poses[0], np.linalg.inv(start), grasped))
-    cm, deg = 100 * np.array(rows)[:, 0], np.degrees(np.array(rows)[:, 1])
-    return AlignmentErrors(
+        motion = estimate.poses[0] @ start
+    seconds = time.perf_counter() - began
+    plain = nearest_error(motion, equivalents(sample, symmetry=False), test)
+    modulo = nearest_error(motion, equivalents(sample, symmetry=True), test)
+    return SampleErrors(
+        aligner=aligner.name if aligner else ORACLE,
         split=split,
-        aligner=aligner.name,
-        count=count,
-        translation_mean=float(cm.mean()),
-        translation_std=float(cm.std()),
-        translation_median=float(np.median(cm)),
-        rotation_mean=float(deg.mean()),
-        rotation_std=float(deg.std()),
-        rotation_median=float(np.median(deg)),
-        success=tuple(float(((cm <= 100 * m) & (deg <= d)).mean()) for m, d in THRESHOLDS),
-        seconds_median=float(np.median(seconds)),
+        index=index,
+        grasped=sample.category[0],
+        target=sample.category[1],
+        translation=plain[0],
+        rotation=plain[1],
+        translation_modulo=modulo[0],
+        rotation_modulo=modulo[1],
+        seconds=seconds,
     )
+
+
+def evaluate_alignment(
+    aligner: Aligner | None,
+    split: str,
+    count: int,
+    *,
+    results: Path | None = None,
+    version: str = "",
+) -> tuple[AlignmentErrors, list[SampleErrors]]:
+    """Aligns the first `count` samples of a set; every aligner gets the same samples and starts.
+
+    Without an aligner the oracle answers; samples on which it has no answer are left out of the
+    means and of the count. `results` (JSON lines) is appended to and gone on from; it belongs to
+    one `version` of the aligner (the digest of its weights). Raises `IgaDrakeError`.
+    """
+    if split not in sample_sets():
+        raise IgaDrakeError(f"set '{split}' is not known; one of: {', '.join(sample_sets())}")
+    if count < 1:
+        raise IgaDrakeError(f"count {count}: at least 1 sample is needed")
+    name = aligner.name if aligner else ORACLE
+    done = _read_results(results, version) if results else {}
+    rows: list[SampleErrors] = []
+    for index in range(count):
+        row = done.get((name, split, index))
+        if row is None:
+            row = evaluate_sample(aligner, split, index)
+            if row is None:
+                continue
+            if results:
+                with results.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps({"version": version, **asdict(row)}) + "\n")
+        rows.append(row)
+    if not rows:
+        raise IgaDrakeError(f"{name}, set '{split}': no answer in {count} samples")
+    return summarise(rows), rows
+
+
+def summarise(rows: Iterable[SampleErrors]) -> AlignmentErrors:
+    """Means over rows of one aligner and one set."""
+    rows = list(rows)
+    table = np.array(
+        [(r.translation, r.rotation, r.translation_modulo, r.rotation_modulo) for r in rows]
+    )
+    return AlignmentErrors(
+        split=rows[0].split,
+        aligner=rows[0].aligner,
+        count=len(rows),
+        plain=Errors.of(table[:, 0], table[:, 1]),
+        modulo=Errors.of(table[:, 2], table[:, 3]),
+        seconds_median=float(np.median([r.seconds for r in rows])),
+    )
+
+
+def by_category(rows: Iterable[SampleErrors]) -> str:
+    """A table of errors modulo symmetry by the categories that took part, worst first."""
+    table: dict[str, list[tuple[float, float]]] = {}
+    for row in rows:
+        for category in {row.grasped, row.target}:
+            table.setdefault(category, []).append((row.translation_modulo, row.rotation_modulo))
+    lines = [f"{'category':<16} {'count':>5}  cm mean (median)  deg mean (median)"]
+    for category, values in sorted(table.items(), key=lambda item: -np.mean(item[1], 0)[1]):
+        cm, deg = np.array(values).T * [[100.0], [180 / np.pi]]
+        lines.append(
+            f"{category:<16} {len(values):>5}  {cm.mean():5.2f} ({np.median(cm):5.2f})     "
+            f"{deg.mean():5.1f} ({np.median(deg):5.1f})"
+        )
+    return "\n".join(lines)
+
+
+def _read_results(path: Path, version: str) -> dict[tuple[str, str, int], SampleErrors]:
+    """Finished samples of a results file; a torn last line is left out."""
+    done: dict[tuple[str, str, int], SampleErrors] = {}
+    if not path.is_file():
+        return done
+    text = path.read_text(encoding="utf-8")
+    if text and not text.endswith("\n"):  # the process was killed while it wrote
+        text = text[: text.rfind("\n") + 1]
+        path.write_text(text, encoding="utf-8")
+    for number, line in enumerate(text.splitlines(), 1):
+        try:
+            entry = json.loads(line)
+            found = entry.pop("version")
+            row = SampleErrors(**entry)
+        except (ValueError, TypeError, KeyError) as error:
+            raise IgaDrakeError(
+                f"{path}, line {number}: not a result of this command ({error}); name another file"
+            ) from error
+        if row.aligner not in ("icp", ORACLE) and found != version:
+            raise IgaDrakeError(
+                f"{path}, line {number}: made with weights {found}, not {version}: "
+                "name another file"
+            )
+        done[row.aligner, row.split, row.index] = row
+    return done
+
+
+def digest(weights: Path) -> str:
+    """Of a checkpoint's bytes: what results made with it are known by."""
+    return sha256(weights.read_bytes()).hexdigest()[:16]
 
 
 def model_card(weights: Path, errors: list[AlignmentErrors]) -> str:
@@ -116,14 +313,14 @@ def model_card(weights: Path, errors: list[AlignmentErrors]) -> str:
         "",
         f"{card['parameters']:,} parameters, {card['step']:,} steps, {card['samples_seen']:,} "
         f"samples seen in {card['seconds'] / 60:.0f} minutes, seed {seed}, commit {commit}, "
-        f"SHA-256 {sha256(weights.read_bytes()).hexdigest()[:16]}.",
+        f"SHA-256 {digest(weights)}.",
         "",
         "Errors: four demonstrations, the test pair's grasped cloud at a Haar-random pose; "
-        "mean ± standard deviation (median).",
+        "mean ± standard deviation (median); plain and modulo symmetry.",
         "",
         "```",
         HEADER,
-        *(row.row() for row in errors),
+        *(row.rows() for row in errors),
         "```",
         "",
     ]

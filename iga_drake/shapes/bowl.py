@@ -1,10 +1,12 @@
 """Bowls: a turned shell with a foot ring, a curved wall and a rim that may lean outwards."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from iga_drake.shapes import surfaces
+from iga_drake.shapes.family import Draft, Family, Parameters, Part
 from iga_drake.shapes.instance import ShapeError, ShapeInstance, frame
 
 FAMILY = "bowl"
@@ -42,7 +44,10 @@ def sample_parameters(rng: np.random.Generator) -> dict[str, float]:
 
 def profile(parameters: dict[str, float]) -> surfaces.ShellProfile:
     """The (r, z) outline of a bowl (m), z = 0 under the foot ring."""
-    p = _checked(parameters)
+    return _profile(_checked(parameters))
+
+
+def _profile(p: Parameters) -> surfaces.ShellProfile:
     radius = p["diameter"] / 2
     height = p["height_ratio"] * p["diameter"]
     base, foot = p["base_ratio"] * radius, p["foot_height"]
@@ -75,29 +80,30 @@ def profile(parameters: dict[str, float]) -> surfaces.ShellProfile:
     )
 
 
-def build(parameters: dict[str, float]) -> ShapeInstance:
-    """Makes the bowl of these `RANGES` parameters. Raises `ShapeError` for a missing or bad one."""
-    shell = profile(parameters)
+def draft(parameters: Parameters) -> Draft:
+    """The bowl's part and frames from its shape's parameters."""
+    shell = _profile(parameters)
     surface = surfaces.lathe(shell.profile, segments=SEGMENTS)
-    labels = shell.bands[surfaces.lathe_face_bands(len(shell.profile), SEGMENTS)]
+    bands = shell.bands[surfaces.lathe_face_bands(len(shell.profile), SEGMENTS)]
     rim = float(shell.profile[:, 1].max())
     floor = float(shell.inner[0, 1])
-    instance = ShapeInstance(
-        family=FAMILY,
-        parameters=parameters,
-        vertices=surface.vertices,
-        faces=surface.faces,
-        part_labels=labels,
-        part_names=PART_NAMES,
-        frames={
-            "base": frame((0.0, 0.0, 0.0)),
-            "opening": frame((0.0, 0.0, rim)),
-            "rim": _rim_frame(shell),
-            "floor": frame((0.0, 0.0, floor)),
-        },
-        convex_pieces=_pieces(shell),
-    )
-    return instance.with_mass(parameters["mass"])
+    frames = {
+        "base": frame((0.0, 0.0, 0.0)),
+        "opening": frame((0.0, 0.0, rim)),
+        "rim": _rim_frame(shell),
+        "floor": frame((0.0, 0.0, floor)),
+    }
+    return Draft((Part("bowl", surface, lambda: _pieces(shell), (PART_NAMES, bands)),), frames)
+
+
+_FAMILY = Family(FAMILY, {key: RANGES[key] for key in RANGES if key != "mass"}, draft)
+
+
+def build(parameters: dict[str, float]) -> ShapeInstance:
+    """Makes the bowl of these `RANGES` parameters. Raises `ShapeError` for a missing or bad one."""
+    p = _checked(parameters)
+    instance = _FAMILY.build({key: p[key] for key in _FAMILY.ranges})
+    return replace(instance, parameters=p).with_mass(p["mass"])
 
 
 def _rim_frame(shell: surfaces.ShellProfile) -> np.ndarray:

@@ -4,6 +4,7 @@ A category is drawn once (which parts, where they sit); its instances vary each 
 and place. All instances of a category share faces and vertex order.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +31,7 @@ class _Part:
     direction: np.ndarray  # (3,) unit, where it leaves its parent
     spin: float
     parent: int
-    seed: int
+    form: np.ndarray  # (5,) in [0, 1], what is common to all instances of the part
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class CompositeCategory:
                     direction=direction / np.linalg.norm(direction),
                     spin=float(rng.uniform(0, 2 * np.pi)),
                     parent=int(rng.integers(0, k)) if k else -1,
-                    seed=int(rng.integers(1 << 31)),
+                    form=rng.random(5),
                 )
             )
         return CompositeCategory(tuple(parts))
@@ -65,7 +66,7 @@ class CompositeCategory:
         reaches: list[np.ndarray] = []
         for part in self.parts:
             size = part.size * np.exp(rng.normal(size=3) * spread)
-            surface = _surface(part.kind, size, np.random.default_rng(part.seed), rng, spread)
+            surface = _surface(part.kind, size, part.form, rng, spread)
             direction = part.direction + rng.normal(size=3) * 0.25 * spread
             direction /= np.linalg.norm(direction)
             X = np.eye(4)
@@ -84,17 +85,25 @@ class CompositeCategory:
 
 
 def _frame_along(direction: np.ndarray, spin: float) -> np.ndarray:
-    z = direction
-    helper = np.array([1.0, 0, 0]) if abs(z[0]) < 0.7 else np.array([0, 1.0, 0])
-    x = np.cross(helper, z)
-    x /= np.linalg.norm(x)
-    y = np.cross(z, x)
-    c, s = np.cos(spin), np.sin(spin)
-    return np.column_stack((c * x + s * y, -s * x + c * y, z))
+    """A rotation (3, 3) whose z axis is the unit vector `direction`; written out for speed."""
+    a, b, c = direction.tolist()
+    # x0 is perpendicular to z and to the world's x (or y) axis, y0 = z x x0.
+    x0 = (0.0, -c, b) if abs(a) < 0.7 else (c, 0.0, -a)
+    norm = math.sqrt(x0[0] ** 2 + x0[1] ** 2 + x0[2] ** 2)
+    p, q, r = x0[0] / norm, x0[1] / norm, x0[2] / norm
+    u, v, w = b * r - c * q, c * p - a * r, a * q - b * p
+    k, s = math.cos(spin), math.sin(spin)
+    return np.array(
+        [
+            [k * p + s * u, k * u - s * p, a],
+            [k * q + s * v, k * v - s * q, b],
+            [k * r + s * w, k * w - s * r, c],
+        ]
+    )
 
 
 def _surface(
-    kind: str, size: np.ndarray, fixed: np.random.Generator, rng: np.random.Generator, spread: float
+    kind: str, size: np.ndarray, form: np.ndarray, rng: np.random.Generator, spread: float
 ) -> Surface:
     """A closed part; roots of attached kinds are at the origin, growing along +z."""
     vary = 1 + spread * rng.normal(size=4) * 0.5
@@ -104,7 +113,7 @@ def _surface(
         return ellipsoid(size / 2, rings=11, segments=20)
     if kind == "turned":
         z = np.linspace(0, 1, 12)
-        waves = fixed.uniform(-0.35, 0.35, 3)
+        waves = 0.35 * (2 * form[:3] - 1)
         r = 1 + sum(w * np.sin((k + 1) * np.pi * z + k) for k, w in enumerate(waves)) * vary[0]
         r = np.clip(r, 0.25, 2.0) * size[0] / 2
         z = (z - 0.5) * size[2]
@@ -114,7 +123,7 @@ def _surface(
         return lathe(profile, segments=20, ratio=float(np.clip(size[1] / size[0], 0.4, 1.5)))
     if kind == "vessel":
         z = np.linspace(0, 1, 10)
-        low, bulge = fixed.uniform(0.5, 1.1), fixed.uniform(-0.1, 0.4) * vary[0]
+        low, bulge = 0.5 + 0.6 * form[0], (0.5 * form[1] - 0.1) * vary[0]
         r = (low + (1 - low) * z + bulge * np.sin(np.pi * z)) * size[0] / 2
         outer = np.column_stack((np.maximum(r, 0.01), z * size[2]))
         wall = float(min(0.004, 0.2 * size.min()))
@@ -123,7 +132,7 @@ def _surface(
         return Surface(body.vertices - [0, 0, size[2] / 2], body.faces)
     width, height = size[0] * 0.3, size[1] * 0.3
     length = float(size[2]) * 1.4
-    bend = fixed.uniform(-0.6, 0.6, 2) * vary[:2]
+    bend = 0.6 * (2 * form[:2] - 1) * vary[:2]
     if kind == "loop":
         path = bezier(
             length * np.array([[-0.3, 0, 0], [-0.3 + bend[0], 0, 1.0], [0.3, 0, 1.0], [0.3, 0, 0]]),
@@ -131,6 +140,6 @@ def _surface(
         )
         return tube(path, width=width, height=height, up=(0.0, 1.0, 0.01), segments=10)
     path = bezier(length * np.array([[0, 0, 0], [0, 0, 0.5], [bend[0], bend[1], 1.0]]), 12)
-    taper = np.linspace(1, 1.0 if kind == "rod" else fixed.uniform(0.15, 0.5) * vary[2], 12)
+    taper = np.linspace(1, 1.0 if kind == "rod" else (0.15 + 0.35 * form[2]) * vary[2], 12)
     taper = np.clip(taper, 0.1, 2)
     return tube(path, width=width * taper, height=height * taper, up=(1.0, 0.05, 0.0), segments=10)

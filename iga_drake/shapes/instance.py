@@ -150,14 +150,24 @@ def frame(
     z: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 1.0),
 ) -> np.ndarray:
     """X_OF (4, 4) at `origin` (m) with the x axis along `x` and z as near to `z` as it can be."""
-    x_axis = np.asarray(x, dtype=np.float64)
-    x_axis = x_axis / np.linalg.norm(x_axis)
-    y_axis = np.cross(np.asarray(z, dtype=np.float64), x_axis)
+    x_axis = _unit(x)
+    y_axis = _cross(np.asarray(z, dtype=np.float64), x_axis)
     norm = np.linalg.norm(y_axis)
     if norm < 1e-9:
         raise ShapeError("frame: x and z are parallel")
     y_axis = y_axis / norm
     X = np.eye(4)
-    X[:3, 0], X[:3, 1], X[:3, 2] = x_axis, y_axis, np.cross(x_axis, y_axis)
+    X[:3, 0], X[:3, 1], X[:3, 2] = x_axis, y_axis, _cross(x_axis, y_axis)
     X[:3, 3] = origin
     return X
+
+
+def _unit(vector: tuple[float, float, float] | np.ndarray) -> np.ndarray:
+    array = np.asarray(vector, dtype=np.float64)
+    return array / np.linalg.norm(array)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of two vectors (3,); several times as quick as `np.cross`."""
+    (u, v, w), (x, y, z) = a.tolist(), b.tolist()
+    return np.array([v * z - w * y, w * x - u * z, u * y - v * x])

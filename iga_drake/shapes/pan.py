@@ -1,8 +1,11 @@
 """Pans: a turned shell with sloping walls and one handle that can be grasped from above."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from iga_drake.shapes import surfaces
+from iga_drake.shapes.family import Draft, Family, Parameters, Part
 from iga_drake.shapes.instance import ShapeError, ShapeInstance, frame
 
 FAMILY = "pan"
@@ -56,7 +59,10 @@ def sample_parameters(rng: np.random.Generator) -> dict[str, float]:
 
 def profile(parameters: dict[str, float]) -> surfaces.ShellProfile:
     """The (r, z) outline of the pan's body (m), standing on z = 0."""
-    p = _checked(parameters)
+    return _profile(_checked(parameters))
+
+
+def _profile(p: Parameters) -> surfaces.ShellProfile:
     radius = p["diameter"] / 2
     base = p["base_ratio"] * radius
     edge = [base + 0.8 * (radius - base) * p["bulge"] + 0.002, 0.05 * p["height"] + 0.001]
@@ -76,7 +82,7 @@ def profile(parameters: dict[str, float]) -> surfaces.ShellProfile:
     )
 
 
-def _handle_path(p: dict[str, float], shell: surfaces.ShellProfile) -> np.ndarray:
+def _handle_path(p: Parameters, shell: surfaces.ShellProfile) -> np.ndarray:
     """(HANDLE_RINGS, 3) from the middle of the wall outwards along +x."""
     height = p["height"] - 0.5 * p["handle_height"] - 0.002
     wall = (shell.outer + shell.inner) / 2
@@ -90,12 +96,11 @@ def _handle_path(p: dict[str, float], shell: surfaces.ShellProfile) -> np.ndarra
     return np.column_stack([x, np.zeros_like(x), z])
 
 
-def build(parameters: dict[str, float]) -> ShapeInstance:
-    """Makes the pan of these `RANGES` parameters. Raises `ShapeError` for a missing or bad one."""
-    p = _checked(parameters)
-    shell = profile(p)
+def draft(p: Parameters) -> Draft:
+    """The pan's parts and frames from its shape's parameters."""
+    shell = _profile(p)
     body = surfaces.lathe(shell.profile, segments=SEGMENTS)
-    body_labels = shell.bands[surfaces.lathe_face_bands(len(shell.profile), SEGMENTS)]
+    bands = shell.bands[surfaces.lathe_face_bands(len(shell.profile), SEGMENTS)]
     path = _handle_path(p, shell)
     taper = np.linspace(1.0, p["handle_taper"], HANDLE_RINGS)
     # The inner end keeps inside the wall: a flat cap there, a round one at the free end.
@@ -108,28 +113,31 @@ def build(parameters: dict[str, float]) -> ShapeInstance:
         caps=(0.2 * p["wall"], 0.35 * p["handle_height"]),
         cap_rings=_CAP_RINGS,
     )
-    surface, which = surfaces.join([body, handle])
-    labels = np.where(which == 1, len(PART_NAMES) - 1, 0)
-    labels[: len(body_labels)] = body_labels
     grasp = round(GRASP_AT * (HANDLE_RINGS - 1))
-    return ShapeInstance(
-        family=FAMILY,
-        parameters=p,
-        vertices=surface.vertices,
-        faces=surface.faces,
-        part_labels=labels,
-        part_names=PART_NAMES,
-        frames={
-            "base": frame((0.0, 0.0, 0.0)),
-            "rim": frame((0.0, 0.0, p["height"])),
-            "handle": frame(path[grasp], x=path[grasp + 1] - path[grasp - 1]),
-        },
-        convex_pieces=_pieces(shell, handle),
-    ).with_mass(p["mass"])
+    parts = (
+        Part("pan", body, lambda: _body_pieces(shell), (PART_NAMES[:-1], bands)),
+        Part("handle", handle, lambda: _handle_pieces(handle)),
+    )
+    frames = {
+        "base": frame((0.0, 0.0, 0.0)),
+        "rim": frame((0.0, 0.0, p["height"])),
+        "handle": frame(path[grasp], x=path[grasp + 1] - path[grasp - 1]),
+    }
+    return Draft(parts, frames)
 
 
-def _pieces(shell: surfaces.ShellProfile, handle: surfaces.Surface) -> tuple[np.ndarray, ...]:
-    """Wall sectors, a floor plate raised off the table and three lengths of handle."""
+_FAMILY = Family(FAMILY, {key: RANGES[key] for key in RANGES if key != "mass"}, draft)
+
+
+def build(parameters: dict[str, float]) -> ShapeInstance:
+    """Makes the pan of these `RANGES` parameters. Raises `ShapeError` for a missing or bad one."""
+    p = _checked(parameters)
+    instance = _FAMILY.build({key: p[key] for key in _FAMILY.ranges})
+    return replace(instance, parameters=p).with_mass(p["mass"])
+
+
+def _body_pieces(shell: surfaces.ShellProfile) -> list[np.ndarray]:
+    """Wall sectors and a floor plate raised off the table."""
     levels = (0, 1, 2, 3, 5, 8, WALL_POINTS - 1)
     outer, inner = shell.outer[list(levels)].copy(), shell.inner[list(levels)].copy()
     inner[-1, 1] = outer[-1, 1] = shell.profile[:, 1].max()
@@ -139,6 +147,11 @@ def _pieces(shell: surfaces.ShellProfile, handle: surfaces.Surface) -> tuple[np.
     floor = shell.inner[0]
     radius = max(floor[0], shell.outer[0, 0])
     plate = np.concatenate([surfaces.turn(np.array([radius, z]), ring) for z in (0.0005, floor[1])])
+    return [*wall, plate]
+
+
+def _handle_pieces(handle: surfaces.Surface) -> list[np.ndarray]:
+    """Three lengths of handle."""
     # Few facets where the pads touch make contact surfaces quick: ends of the lengths only.
     lengths = surfaces.tube_pieces(
         handle, segments=HANDLE_SEGMENTS, cuts=_HANDLE_CUTS, ends_only=True
@@ -146,7 +159,7 @@ def _pieces(shell: surfaces.ShellProfile, handle: surfaces.Surface) -> tuple[np.
     lengths += surfaces.tube_pieces(
         handle, segments=HANDLE_SEGMENTS, cuts=(_HANDLE_CUTS[-1], _HANDLE_END)
     )
-    return (*wall, plate, *lengths)
+    return lengths
 
 
 def _checked(parameters: dict[str, float]) -> dict[str, float]:

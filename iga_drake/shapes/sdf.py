@@ -7,14 +7,17 @@ them, anything else rigid falls back to point contact.
 
 import hashlib
 import os
+import re
 import shutil
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
-from iga_drake.shapes.instance import ShapeInstance
+from iga_drake.shapes.instance import ShapeError, ShapeInstance
 
 _CREASE = np.radians(40.0)
 
@@ -38,6 +41,58 @@ def write_sdf(
         into 2 a b / (a + b).
     """
     meshes = _write_meshes(instance, Path(folder))
+    return _sdf(instance, meshes.as_uri(), name=name, color=color, friction=friction)
+
+
+def write_sdf_file(
+    instance: ShapeInstance,
+    folder: Path | str,
+    *,
+    name: str,
+    color: tuple[float, float, float] = (0.8, 0.8, 0.8),
+    friction: float = 0.8,
+) -> Path:
+    """Writes `folder`/`name`.sdf and its meshes, and returns the file's path.
+
+    The file refers to the meshes by relative paths, so that the folder can be moved, and holds the
+    instance's named frames, which `write_sdf` leaves out.
+
+    Raises `ShapeError` where `name` can't be a model's, a file's and a link's name.
+    """
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", name) or name == "world":
+        raise ShapeError(
+            f"name {name!r}: expected letters, digits, _ and -, a letter first, and not 'world'"
+        )
+    if name in instance.frames:
+        raise ShapeError(
+            f"name '{name}': {instance.family} has a frame of this name; choose another one than "
+            f"{', '.join(sorted(instance.frames))}"
+        )
+    folder = Path(folder)
+    meshes = _write_meshes(instance, folder)
+    text = _sdf(
+        instance, meshes.name, name=name, color=color, friction=friction, frames=instance.frames
+    )
+    path = folder / f"{name}.sdf"
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+def _sdf(
+    instance: ShapeInstance,
+    meshes: str,
+    *,
+    name: str,
+    color: tuple[float, float, float],
+    friction: float,
+    frames: Mapping[str, np.ndarray] | None = None,
+) -> str:
+    """SDF text; `meshes` is the URI of the folder with visual.obj and piece_<i>.obj."""
     mass = instance.mass_properties
     inertia = mass.I_CcmO
     r, g, b = color
@@ -45,7 +100,7 @@ def write_sdf(
         f"""
       <collision name="piece_{index}">
         <geometry><mesh>
-          <uri>{(meshes / f"piece_{index}.obj").as_uri()}</uri><drake:declare_convex/>
+          <uri>{meshes}/piece_{index}.obj</uri><drake:declare_convex/>
         </mesh></geometry>
         <drake:proximity_properties>
           <drake:rigid_hydroelastic/>
@@ -54,6 +109,13 @@ def write_sdf(
         </drake:proximity_properties>
       </collision>"""
         for index in range(len(instance.convex_pieces))
+    )
+    named = "".join(
+        f"""
+    <frame name="{frame}" attached_to="{name}">
+      <pose relative_to="{name}" rotation_format="quat_xyzw">{_pose(X_OF)}</pose>
+    </frame>"""
+        for frame, X_OF in (frames or {}).items()
     )
     x, y, z = mass.p_OCcm
     return f"""<?xml version="1.0"?>
@@ -69,13 +131,19 @@ def write_sdf(
         </inertia>
       </inertial>
       <visual name="surface">
-        <geometry><mesh><uri>{(meshes / "visual.obj").as_uri()}</uri></mesh></geometry>
+        <geometry><mesh><uri>{meshes}/visual.obj</uri></mesh></geometry>
         <material><diffuse>{r:.4g} {g:.4g} {b:.4g} 1</diffuse></material>
       </visual>{pieces}
-    </link>
+    </link>{named}
   </model>
 </sdf>
 """
+
+
+def _pose(X: np.ndarray) -> str:
+    """x y z qx qy qz qw of a transform (4, 4)."""
+    quaternion = Rotation.from_matrix(X[:3, :3]).as_quat()
+    return " ".join(f"{value:.12g}" for value in (*X[:3, 3], *quaternion))
 
 
 def _write_meshes(instance: ShapeInstance, folder: Path) -> Path:

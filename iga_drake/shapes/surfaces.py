@@ -153,6 +153,28 @@ def bezier(control: np.ndarray, count: int) -> np.ndarray:
     return resample(points[:, 0], count)
 
 
+@lru_cache(maxsize=64)
+def _bspline_basis(controls: int, count: int) -> np.ndarray:
+    from scipy.interpolate import BSpline
+
+    degree = min(3, controls - 1)
+    knots = np.concatenate(
+        [np.zeros(degree), np.linspace(0.0, 1.0, controls - degree + 1), np.ones(degree)]
+    )
+    basis = BSpline.design_matrix(np.linspace(0.0, 1.0, count), knots, degree)
+    return _read_only(basis.toarray())
+
+
+def bspline(control: np.ndarray, count: int) -> np.ndarray:
+    """(count, D) points of the clamped uniform cubic B-spline with control points (n, D).
+
+    Points lie at equal steps of the parameter. The curve starts and ends at the outer control
+    points, along the first and last leg, and stays in the control points' hull.
+    """
+    control = np.asarray(control, dtype=np.float64)
+    return _bspline_basis(len(control), count) @ control
+
+
 def shell_profile(
     outer: np.ndarray,
     *,
@@ -213,6 +235,13 @@ def shell_profile(
     return ShellProfile(profile, bands, outer, inner)
 
 
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(N, 3) cross products of (N, 3); NumPy's own is several times slower for few vectors."""
+    a0, a1, a2 = a.T
+    b0, b1, b2 = b.T
+    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=1)
+
+
 def _sections(
     path: np.ndarray,
     tangent: np.ndarray,
@@ -223,12 +252,12 @@ def _sections(
     segments: int,
 ) -> np.ndarray:
     """(N, S, 3) superellipse rings, counterclockwise about the tangent."""
-    side = np.cross(up, tangent)
+    side = _cross(up, tangent)
     norm = np.linalg.norm(side, axis=1, keepdims=True)
     if (norm < 1e-6).any():
         raise ShapeError("tube: `up` is parallel to the path: choose another up direction")
     side = side / norm
-    top = np.cross(tangent, side)
+    top = _cross(tangent, side)
     section = superellipse(segments, exponent)  # (N, S, 2)
     return (
         path[:, None]
@@ -452,4 +481,58 @@ def tube_pieces(
         parts += [surface.vertices[:1]] if low == 0 else []
         parts += [surface.vertices[-1:]] if high == len(rings) - 1 else []
         pieces.append(np.concatenate(parts))
+    return pieces
+
+
+def chord_cuts(curves: np.ndarray, tolerance: float) -> list[int]:
+    """Point indices at which to cut curves (C, K, D) so that they stay near the chords between.
+
+    The fewest cuts, first and last point included, that keep every point of every curve within
+    `tolerance` (m) of its chord.
+    """
+    curves = np.asarray(curves, dtype=np.float64)
+    cuts, last = [0], curves.shape[1] - 1
+    while cuts[-1] < last:
+        end = cuts[-1] + 1
+        while end < last and _sagitta(curves[:, cuts[-1] : end + 2]) <= tolerance:
+            end += 1
+        cuts.append(end)
+    return cuts
+
+
+def _sagitta(curves: np.ndarray) -> float:
+    """Greatest distance (m) of points of curves (C, K, D) from their curve's chord."""
+    chord = curves[:, -1] - curves[:, 0]
+    direction = chord / np.maximum(np.linalg.norm(chord, axis=-1, keepdims=True), 1e-12)
+    arm = curves - curves[:, :1]
+    off = arm - (arm * direction[:, None]).sum(axis=-1, keepdims=True) * direction[:, None]
+    return float(np.linalg.norm(off, axis=-1).max())
+
+
+def wall_pieces(
+    outer: np.ndarray, inner: np.ndarray, rim: np.ndarray, *, tolerance: float | None = None
+) -> list[np.ndarray]:
+    """Convex pieces of a vessel's wall of any section, from its rings.
+
+    `outer` and `inner` (K, S, 3) are matching rings from below to above, `rim` (S, 3) closes the
+    wall above. The wall is cut between rings and then into sectors, each the hull of its outer
+    points and of the ends of its inner arcs. The inner wall's arcs lie within `tolerance` (m) of
+    their chords, which are moved into the wall by up to half of that: so pieces stick into the
+    cavity by little more than half the tolerance. Default: 3.5 mm, 5 % of the radius of wide ones.
+    """
+    if tolerance is None:
+        tolerance = max(0.0035, 0.02 * float(np.ptp(outer[..., :2], axis=(0, 1)).max()))
+    gap = outer - inner
+    distance = np.linalg.norm(gap, axis=-1, keepdims=True)
+    inner = inner + gap * np.minimum(0.45, 0.5 * tolerance / np.maximum(distance, 1e-9))
+    closed = np.append(np.arange(outer.shape[1]), 0)
+    sides = np.concatenate([outer[:, ::3], inner[:, ::3]], axis=1).swapaxes(0, 1)
+    pieces = []
+    for low, high in pairwise(chord_cuts(sides, min(tolerance, 0.0035))):
+        levels = np.unique(np.linspace(low, high, 5).round().astype(int))
+        for start, end in pairwise(chord_cuts(inner[low : high + 1][:, closed], tolerance)):
+            arc = closed[start : end + 1]
+            parts = [outer[levels][:, arc], inner[levels][:, arc[[0, -1]]]]
+            parts += [rim[None, arc]] if high == len(outer) - 1 else []
+            pieces.append(np.concatenate([part.reshape(-1, 3) for part in parts]))
     return pieces

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from iga_drake.shapes.instance import ShapeError
 
@@ -38,14 +39,15 @@ class Symmetry:
         """(3,) unit vector of the axis in O."""
         return np.eye(3)["xyz".index(self.axis)]
 
+    def angles(self, steps: int = 72) -> np.ndarray:
+        """(n,) rad, of the group's rotations, 0 first; `steps` of them for any angle."""
+        count = self.order or steps
+        return 2 * np.pi / count * np.arange(count)
+
     def rotations(self, steps: int = 72) -> np.ndarray:
         """(n, 3, 3) the group's rotations, identity first; `steps` of them for any angle."""
-        count = self.order or steps
-        angle = 2 * np.pi / count * np.arange(count)
-        k = self.direction
-        K = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
-        s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-        return np.eye(3) + s * K + (1 - c) * (K @ K)
+        vectors = self.angles(steps)[:, None] * self.direction
+        return Rotation.from_rotvec(vectors).as_matrix()
 
 
 NO_SYMMETRY = Symmetry()

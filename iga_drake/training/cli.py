@@ -5,12 +5,18 @@ from pathlib import Path
 
 import torch
 
+from iga_drake.training import dif_net
 from iga_drake.training.descriptor import DescriptorTraining, train_descriptor
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the training command."""
-    parser.add_argument("network", choices=("descriptor",), help="what to train")
+    networks = parser.add_subparsers(dest="network", required=True, help="what to train")
+    _add_descriptor(networks.add_parser("descriptor", help="dense descriptors of the iga aligner"))
+    dif_net.add_arguments(networks.add_parser("dif-net", help="deformed implicit field of chairs"))
+
+
+def _add_descriptor(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of weights, state and log")
     parser.add_argument("--steps", type=int, default=DescriptorTraining.steps)
     parser.add_argument(
@@ -28,6 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(arguments: argparse.Namespace) -> int:
     """Runs the training; a run that was stopped (or killed) goes on from its last checkpoint."""
+    if arguments.network == "dif-net":
+        return dif_net.main(arguments)
     torch.set_num_threads(arguments.threads)
     torch.set_flush_denormal(True)
     card = train_descriptor(

@@ -8,7 +8,6 @@ import dataclasses
 import json
 import subprocess
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,12 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from iga_drake.aligners.checkpoint import load_checkpoint, save_checkpoint
+from iga_drake.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
 from iga_drake.aligners.iga.weights import DESCRIPTOR as KIND
 from iga_drake.aligners.iga.weights import descriptor_config
-from iga_drake.dataset.samples import SampleConfig, make_sample
+from iga_drake.dataset.loader import sample_loader
+from iga_drake.dataset.samples import SampleConfig
 from iga_drake.geometry.clouds import furthest_point_sampling
+
+FEWER_PAIRS = 0.5  # of the steps use fewer than all pairs of a sample
 
 
 @dataclass(frozen=True)
@@ -43,15 +45,6 @@ class DescriptorTraining:
     seed: int = 0
 
 
-def collate(indices: list[int], split: str, config: SampleConfig) -> dict[str, Tensor]:
-    """Samples stacked: points and canonical (S, 2, N, P, 3)."""
-    samples = [make_sample(split, index, config) for index in indices]
-    return {
-        "points": torch.from_numpy(np.stack([s.points for s in samples])),
-        "canonical": torch.from_numpy(np.stack([s.canonical for s in samples])),
-    }
-
-
 def correspondence_loss(
     net: DescriptorNet, batch: dict[str, Tensor], config: DescriptorTraining
 ) -> tuple[Tensor, dict[str, float]]:
@@ -64,7 +57,7 @@ def correspondence_loss(
     place = torch.gather(canonical, 1, nodes[..., None].expand(-1, -1, 3))
     M = config.nodes
     with torch.autocast(points.device.type, torch.bfloat16, enabled=config.bf16):
-        descriptors = net(points, nodes)
+        descriptors = net(points, nodes, group=N)
     descriptors = descriptors.float().reshape(2 * S, N * M, -1)
     place = place.reshape(2 * S, N * M, 3)
     logits = net.similarity(descriptors, descriptors).reshape(2 * S, N, M, N, M)
@@ -93,12 +86,11 @@ def _learning_rate(step: int, config: DescriptorTraining) -> float:
     )
 
 
-def _batches(first: int, config: DescriptorTraining, samples: SampleConfig) -> Iterator[dict]:
-    step = first
-    while True:
-        base = config.seed * 10_000_000 + step * config.batch
-        yield collate(list(range(base, base + config.batch)), "train", samples)
-        step += 1
+def _some_pairs(batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The first pairs of a batch, two or more: any number of demonstrations will be asked for."""
+    N = batch["points"].shape[2]
+    group = int(torch.randint(2, N + 1, ())) if torch.rand(()) < FEWER_PAIRS else N
+    return {name: values[:, :, :group] for name, values in batch.items()}
 
 
 def validate(
@@ -111,9 +103,8 @@ def validate(
     torch.manual_seed(0)
     net.eval()
     with torch.no_grad():
-        for base in range(0, count, 8):
-            batch = collate(list(range(base, min(base + 8, count))), split, samples)
-            batch = {k: v.to(device) for k, v in batch.items()}
+        for batch in sample_loader(split, config=samples, batch=8, count=count):
+            batch = {k: batch[k].to(device) for k in ("points", "canonical")}
             rows.append(correspondence_loss(net, batch, config)[1])
     torch.set_rng_state(torch_state)
     net.train()
@@ -129,6 +120,17 @@ def _commit() -> str:
         return ""
 
 
+def _take_over(net: DescriptorNet, tensors: dict[str, Tensor], path: Path) -> None:
+    """Loads weights; layers that the checkpoint lacks keep their start."""
+    own = net.state_dict()
+    wrong = sorted(n for n, t in tensors.items() if n not in own or own[n].shape != t.shape)
+    if wrong:
+        raise CheckpointError(
+            f"{path}: {wrong[0]} does not fit this network: start from weights of its sizes"
+        )
+    net.load_state_dict(tensors, strict=False)
+
+
 def train_descriptor(
     output: Path,
     *,
@@ -142,6 +144,7 @@ def train_descriptor(
     checkpoint_every: int = 200,
     stop_at: int | None = None,
     validation_count: int = 64,
+    workers: int = 0,
 ) -> dict:
     """Trains until `config.steps`, `stop_at` or `minutes`; resumes from `output` where it can.
 
@@ -179,7 +182,7 @@ def train_descriptor(
     else:
         if initial is not None:
             loaded, _ = load_checkpoint(initial, kind=KIND)
-            net.load_state_dict(loaded)
+            _take_over(net, loaded, initial)
         ema = {n: p.detach().clone() for n, p in net.named_parameters()}
     output.mkdir(parents=True, exist_ok=True)
     log = (output / "log.jsonl").open("a")
@@ -209,10 +212,19 @@ def train_descriptor(
         save_checkpoint(state_path, state, kind=KIND + "-state", card=card)
         return card
 
-    batches = _batches(step, config, samples)
+    batches = iter(
+        sample_loader(
+            "train",
+            config=samples,
+            batch=config.batch,
+            first=config.seed * 10_000_000 + step * config.batch,
+            workers=workers,
+        )
+    )
     last = config.steps if stop_at is None else min(stop_at, config.steps)
     while step < last and time.monotonic() - began < 60 * minutes:
-        batch = {k: v.to(device) for k, v in next(batches).items()}
+        whole = next(batches)
+        batch = _some_pairs({k: whole[k].to(device) for k in ("points", "canonical")})
         for group in optimizer.param_groups:
             group["lr"] = _learning_rate(step, config)
         loss, row = correspondence_loss(net, batch, config)

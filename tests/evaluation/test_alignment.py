@@ -1,19 +1,28 @@
 """Pose errors against hand-made poses, and the evaluation with aligners that know the answer."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from iga_drake.aligners.checkpoint import load_checkpoint
+from iga_drake.checkpoint import load_checkpoint
 from iga_drake.aligners.iga.aligner import default_weights
 from iga_drake.aligners.protocol import PoseEstimate
+from iga_drake.dataset.samples import make_sample
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.alignment import (
+    CONFIG,
+    by_category,
+    equivalents,
     evaluate_alignment,
     model_card,
+    nearest_error,
     pose_errors,
     random_pose,
 )
+from iga_drake.shapes.families import FAMILIES
 
 
 def test_pose_errors_of_a_known_offset() -> None:
@@ -30,38 +39,101 @@ def test_pose_errors_of_a_known_offset() -> None:
     assert pose_errors(estimate, truth, cloud) == pytest.approx((0.05, 0.25), abs=1e-9)
 
 
+def _about(point: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """(4, 4) turn by a rotation vector about a line through a point."""
+    X = np.eye(4)
+    X[:3, :3] = Rotation.from_rotvec(vector).as_matrix()
+    X[:3, 3] = point - X[:3, :3] @ point
+    return X
+
+
 class _Fixed:
-    """Answers with the inverse of the start pose times an offset."""
+    """Answers with the inverse of the start pose after a motion in the test pair's frame."""
 
     name = "fixed"
 
-    def __init__(self, offset: np.ndarray):
-        self.offset = offset
+    def __init__(self, motion: np.ndarray):
+        self.motion = motion
+        self.calls = 0
 
     def align(self, context, grasped, target, *, seed=0):
-        return PoseEstimate((self.offset @ np.linalg.inv(random_pose(seed)))[None], [0.0], [1.0])
+        self.calls += 1
+        return PoseEstimate((self.motion @ np.linalg.inv(random_pose(seed)))[None], [0.0], [1.0])
 
 
 def test_the_truth_has_no_error_and_an_offset_shows() -> None:
-    row = evaluate_alignment(_Fixed(np.eye(4)), "validation", 3)
-    assert row.translation_mean == pytest.approx(0, abs=1e-6) and row.success == (1.0, 1.0, 1.0)
+    row, _ = evaluate_alignment(_Fixed(np.eye(4)), "validation", 3)
+    assert row.plain.translation_mean == pytest.approx(0, abs=1e-6)
+    assert row.plain.success == row.modulo.success == (1.0, 1.0, 1.0)
     offset = np.eye(4)
     offset[0, 3] = 0.015
-    row = evaluate_alignment(_Fixed(offset), "unseen_categories", 3)
-    assert row.translation_mean == pytest.approx(1.5) and row.success == (0.0, 1.0, 1.0)
-    assert "1.50" in row.row()
+    row, rows = evaluate_alignment(_Fixed(offset), "unseen_categories", 3)
+    assert row.plain.translation_mean == pytest.approx(1.5)
+    assert row.plain.success == (0.0, 1.0, 1.0) and "1.50" in row.rows()
+    assert [r.translation for r in rows] == pytest.approx([0.015] * 3)
+
+
+def test_any_of_the_modes_is_right() -> None:
+    sample = make_sample("multi_modal", 0, CONFIG)
+    for motion in sample.modes:
+        error = nearest_error(motion, equivalents(sample, symmetry=False), sample.points[0, -1])
+        assert error == pytest.approx((0, 0), abs=1e-6)
+
+
+def test_errors_modulo_symmetry_forgive_the_family_s_own_turns_and_no_others() -> None:
+    sample = make_sample("validation", 0, CONFIG)
+    vase = replace(sample, category=("composite", "composite"))
+    axis_A, axis_B = sample.axes
+    cloud = sample.points[0, -1]
+    symmetric = {name: f.symmetry for name, f in FAMILIES.items() if not f.symmetry.is_trivial}
+    assert any(s.order == 0 for s in symmetric.values())
+    for name, group in symmetric.items():
+        angle = group.angles()[len(group.angles()) // 2]
+        for role, axis in enumerate((axis_A, axis_B)):
+            turn = _about(axis[0], angle * axis[1])
+            names = ["composite", "composite"]
+            names[role] = name
+            there = replace(sample, category=tuple(names))
+            assert nearest_error(turn, equivalents(there, symmetry=True), cloud) == pytest.approx(
+                (0, 0), abs=1e-6
+            )
+            plain = nearest_error(turn, equivalents(there, symmetry=False), cloud)
+            assert plain[1] == pytest.approx(min(angle, 2 * np.pi - angle), abs=1e-6)
+            assert nearest_error(turn, equivalents(vase, symmetry=True), cloud) == plain
+
+
+def test_results_are_gone_on_from_and_belong_to_one_version(tmp_path: Path) -> None:
+    file = tmp_path / "results.jsonl"
+    aligner = _Fixed(np.eye(4))
+    evaluate_alignment(aligner, "validation", 2, results=file, version="a")
+    file.write_text(file.read_text() + '{"version": "a", "alig')  # killed while writing
+    row, _ = evaluate_alignment(aligner, "validation", 3, results=file, version="a")
+    assert aligner.calls == 3 and row.count == 3
+    again, _ = evaluate_alignment(aligner, "validation", 3, results=file, version="a")
+    assert aligner.calls == 3 and again == row
+    with pytest.raises(IgaDrakeError, match="made with weights a, not b"):
+        evaluate_alignment(aligner, "validation", 3, results=file, version="b")
+    file.write_text("hello\n")
+    with pytest.raises(IgaDrakeError, match="line 1: not a result"):
+        evaluate_alignment(aligner, "validation", 1, results=file, version="a")
+
+
+def test_the_oracle_answers_without_an_aligner() -> None:
+    row, rows = evaluate_alignment(None, "easy", 3)
+    assert row.aligner == "oracle" and 0 < row.plain.translation_median < 1.0
+    assert "easy" in row.rows() and rows[0].grasped in by_category(rows)
 
 
 def test_bad_arguments_are_refused() -> None:
-    with pytest.raises(IgaDrakeError, match="one of: validation, unseen_categories"):
-        evaluate_alignment(_Fixed(np.eye(4)), "train", 1)
+    with pytest.raises(IgaDrakeError, match="one of: train, validation"):
+        evaluate_alignment(_Fixed(np.eye(4)), "seen", 1)
     with pytest.raises(IgaDrakeError, match="count 0"):
         evaluate_alignment(_Fixed(np.eye(4)), "validation", 0)
 
 
 def test_the_model_card_tells_what_the_file_says() -> None:
-    row = evaluate_alignment(_Fixed(np.eye(4)), "validation", 1)
+    row, _ = evaluate_alignment(_Fixed(np.eye(4)), "validation", 1)
     _, card = load_checkpoint(default_weights(), kind="descriptor")
     text = model_card(default_weights(), [row])
     assert f"{card['samples_seen']:,} samples" in text
-    assert row.row() in text and "learning_rate" in text
+    assert row.rows() in text and "learning_rate" in text

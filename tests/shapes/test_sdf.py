@@ -5,13 +5,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.geometry import Role, SceneGraph
+from pydrake.geometry import HalfSpace, Role, SceneGraph
+from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.plant import (
+    AddMultibodyPlantSceneGraph,
+    CoulombFriction,
+    MultibodyPlant,
+)
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
 
 from iga_drake.shapes import bowl, pan
-from iga_drake.shapes.instance import ShapeInstance
-from iga_drake.shapes.sdf import write_sdf
+from iga_drake.shapes.families import FAMILIES
+from iga_drake.shapes.instance import ShapeError, ShapeInstance
+from iga_drake.shapes.sdf import write_sdf, write_sdf_file
 
 
 @pytest.fixture(params=[bowl, pan], ids=["bowl", "pan"])
@@ -86,3 +94,78 @@ def test_a_shape_is_written_once_and_shared(instance: ShapeInstance, tmp_path: P
     assert [folder] == list(tmp_path.iterdir())
     assert before == {path: path.stat().st_mtime_ns for path in folder.iterdir()}
     assert '<model name="two">' in sdf and "<diffuse>1 0 0 1</diffuse>" in sdf
+
+
+def test_a_written_file_can_be_moved_and_has_the_frames(
+    instance: ShapeInstance, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_sdf_file(instance, tmp_path / "here", name="thing")
+    assert str(tmp_path) not in path.read_text()
+    moved = (tmp_path / "here").rename(tmp_path / "there") / path.name
+    plant, scene_graph = MultibodyPlant(0.002), SceneGraph()
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    parser = Parser(plant)
+    parser.SetStrictParsing()
+    with caplog.at_level(logging.WARNING):
+        parser.AddModels(moved)
+        plant.Finalize()
+    assert not caplog.records
+    body = plant.GetBodyByName("thing")
+    assert len(plant.GetCollisionGeometriesForBody(body)) == len(instance.convex_pieces)
+    context = plant.CreateDefaultContext()
+    for name, X_OF in instance.frames.items():
+        X = plant.GetFrameByName(name).CalcPose(context, body.body_frame())
+        np.testing.assert_allclose(X.GetAsMatrix4(), X_OF, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["", "a b", "3d", "a/b", "<x>", "world", "__a__"])
+def test_names_that_no_model_can_have_are_refused(
+    name: str, instance: ShapeInstance, tmp_path: Path
+) -> None:
+    with pytest.raises(ShapeError, match="expected letters"):
+        write_sdf_file(instance, tmp_path, name=name)
+
+
+def test_a_name_that_a_frame_has_is_refused(instance: ShapeInstance, tmp_path: Path) -> None:
+    taken = sorted(instance.frames)[0]
+    with pytest.raises(ShapeError, match=f"'{taken}'.*choose another"):
+        write_sdf_file(instance, tmp_path, name=taken)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("family", ["mug", "stool", "box", "shoe"])
+@pytest.mark.parametrize("seed", range(2))
+def test_dropped_on_a_plane_it_settles(family: str, seed: int, tmp_path: Path) -> None:
+    parameters = FAMILIES[family].sample_parameters(np.random.default_rng(seed))
+    check_settles(FAMILIES[family].build(parameters), tmp_path)
+
+
+def check_settles(instance: ShapeInstance, tmp_path: Path) -> None:
+    """From 1 cm above: it gains no energy, comes to rest and its mesh lies on the plane."""
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 0.001)
+    plant.RegisterCollisionGeometry(
+        plant.world_body(), RigidTransform(), HalfSpace(), "plane", CoulombFriction(0.8, 0.8)
+    )
+    Parser(plant).AddModels(write_sdf_file(instance, tmp_path, name="thing"))
+    plant.Finalize()
+    body = plant.GetBodyByName("thing")
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    height = 0.01 - instance.vertices[:, 2].min()
+    plant.SetFreeBodyPose(context, body, RigidTransform([0.0, 0.0, height]))
+
+    def energy() -> float:
+        return plant.EvalKineticEnergy(context) + plant.EvalPotentialEnergy(context)
+
+    started = energy()
+    for time in np.arange(0.1, 2.05, 0.1):
+        simulator.AdvanceTo(time)
+        assert energy() < started
+    velocity = plant.EvalBodySpatialVelocityInWorld(context, body)
+    assert np.linalg.norm(velocity.translational()) < 0.005
+    assert np.linalg.norm(velocity.rotational()) < 0.2
+    X_WO = plant.EvalBodyPoseInWorld(context, body)
+    lowest = X_WO.multiply(instance.vertices.T)[2].min()
+    assert -0.0005 < lowest < 0.003  # collision pieces may stand out of the mesh a little

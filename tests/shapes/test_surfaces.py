@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.interpolate import BSpline
+from scipy.spatial import ConvexHull, Delaunay
 
 from iga_drake.shapes import surfaces
 from iga_drake.shapes.instance import ShapeError
@@ -144,3 +146,49 @@ def test_joined_surfaces_stay_closed_and_labelled() -> None:
 def test_bad_sizes_are_refused(call) -> None:
     with pytest.raises(ShapeError):
         call()
+
+
+def test_a_bspline_is_the_one_of_scipy_and_stays_in_the_hull() -> None:
+    rng = np.random.default_rng(0)
+    control = rng.normal(size=(6, 2))
+    curve = surfaces.bspline(control, 50)
+    knots = [0, 0, 0, 0, 1 / 3, 2 / 3, 1, 1, 1, 1]
+    expected = BSpline(np.array(knots), control, 3)(np.linspace(0, 1, 50))
+    np.testing.assert_allclose(curve, expected, atol=1e-12)
+    np.testing.assert_allclose(curve[[0, -1]], control[[0, -1]], atol=1e-12)
+    hull = Delaunay(control)
+    assert (hull.find_simplex(curve[1:-1] * (1 - 1e-9) + control.mean(axis=0) * 1e-9) >= 0).all()
+
+
+def test_chords_of_an_arc_are_as_near_as_asked_and_as_few_as_can_be() -> None:
+    angle = np.linspace(0, np.pi, 181)
+    arc = 0.1 * np.column_stack([np.cos(angle), np.sin(angle)])
+    cuts = surfaces.chord_cuts(arc[None], 0.002)
+    assert cuts[0] == 0 and cuts[-1] == 180
+    # The sagitta of a chord over the angle a is r (1 - cos(a / 2)).
+    steps = np.radians(np.diff(cuts))
+    assert (0.1 * (1 - np.cos(steps / 2)) <= 0.002 + 1e-9).all()
+    widest = np.floor(np.degrees(2 * np.arccos(1 - 0.002 / 0.1)))  # the curve has whole degrees
+    assert len(steps) == np.ceil(180 / widest)
+    assert surfaces.chord_cuts(np.stack([arc * [1, 0]]), 1e-6) == [0, 180]  # a straight line
+
+
+@pytest.mark.parametrize("exponent", [2.0, 4.0])
+def test_wall_pieces_cover_a_cylinder_and_leave_its_cavity(exponent: float) -> None:
+    height = np.linspace(0, 0.1, 8)
+    ring = surfaces.superellipse(36, exponent)
+    outer, inner = (
+        np.concatenate([np.broadcast_to(r * ring, (8, 36, 2)), np.repeat(height, 36).reshape(
+            8, 36, 1)], axis=2) for r in (0.05, 0.047)
+    )  # fmt: skip
+    pieces = surfaces.wall_pieces(outer, inner, (outer[-1] + inner[-1]) / 2 + [0, 0, 0.001])
+    hulls = [ConvexHull(piece).equations for piece in pieces]
+
+    def inside(points: np.ndarray, tolerance: float) -> np.ndarray:
+        return np.any([(points @ h[:, :3].T + h[:, 3] <= tolerance).all(axis=1) for h in hulls], 0)
+
+    middle = ((outer[1:-1] + inner[1:-1]) / 2).reshape(-1, 3)
+    assert inside(middle, 0.0016).all()
+    free = np.concatenate([s * inner[1:-1].reshape(-1, 3) * [1, 1, 0] for s in (0.9, 0.5, 0.0)])
+    assert not inside(free + [0, 0, 0.05], 0.0).any()
+    assert len(pieces) <= 16

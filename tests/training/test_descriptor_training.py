@@ -4,14 +4,14 @@ from pathlib import Path
 
 import torch
 
-from iga_drake.aligners.checkpoint import load_checkpoint
+from iga_drake.checkpoint import load_checkpoint
 from iga_drake.aligners.iga.descriptor import DescriptorConfig
 from iga_drake.aligners.iga.weights import load_descriptor
 from iga_drake.dataset.samples import SampleConfig
 from iga_drake.training.descriptor import DescriptorTraining, train_descriptor, validate
 
-MODEL = DescriptorConfig(scalars=24, vectors=8, heads=2, layers=1, descriptor=16)
-SAMPLES = SampleConfig(cloud_points=64, surface_points=400, alignments=3)
+MODEL = DescriptorConfig(scalars=24, vectors=8, heads=2, layers=2, descriptor=16)
+SAMPLES = SampleConfig(cloud_points=64, surface_points=400, least_seen=8)
 
 
 def _config(steps: int, **changes) -> DescriptorTraining:

@@ -55,7 +55,7 @@ class IgaAligner:
     ):
         """Takes a network, or reads `weights` (default: the landed checkpoint).
 
-        The network itself is left as it is. Raises `CheckpointError` (`aligners.checkpoint`) for a
+        The network itself is left as it is. Raises `CheckpointError` (`checkpoint`) for a
         missing or foreign file.
         """
         if net is None:
@@ -111,8 +111,8 @@ class IgaAligner:
         points = torch.stack([p for p, _ in prepared])  # (2 (D + 1), P, 3)
         index = furthest_point_sampling(points, self.config.nodes)
         nodes = torch.gather(points, 1, index[..., None].expand(-1, -1, 3))
-        descriptors = self._net(points, index)
         half = len(clouds) // 2
+        descriptors = self._net(points, index, group=half)
         generator = torch.Generator().manual_seed(seed)
         matches: list[list[Match]] = []
         for test in (half - 1, len(clouds) - 1):

@@ -1,10 +1,14 @@
-"""SE(3)-invariant dense descriptors of a point cloud, with whole-object context.
+"""SE(3)-invariant dense descriptors of point clouds, with whole-object context.
 
 Every node carries invariant scalars and equivariant vectors (Vector Neurons, Deng et al. 2021).
 Layers attend over all nodes of the object with invariant pair features only, and pass equivariant
 messages. Cross and triple products make the features sensitive to handedness: without them the left
 and the right side of a mirror-symmetric object would look the same. The result is exactly invariant
 under rotations and translations, and independent of the order of the points for given nodes.
+
+Clouds of the same object (demonstrations and test) may be described together: their nodes then also
+attend to each other's invariant scalars, which says what is common to all of them. The result stays
+invariant under separate motions of every cloud and equivariant under the order of the clouds.
 """
 
 from dataclasses import dataclass
@@ -26,6 +30,8 @@ class DescriptorConfig:
     pair_hidden: int = 24
     distance_bases: int = 8
     descriptor: int = 64
+    # Whether nodes attend to the object's other clouds after every layer but the last.
+    cross: bool = True
 
 
 class VectorLinear(nn.Module):
@@ -175,14 +181,54 @@ class ContextLayer(nn.Module):
         return s, v / norm.clamp_min(1.0)
 
 
+class CrossLayer(nn.Module):
+    """Attention of every node to the nodes of all other clouds of the same object.
+
+    Starts as the identity, so that it can be added to a trained network.
+    """
+
+    def __init__(self, config: DescriptorConfig):
+        super().__init__()
+        d = config.scalars
+        self.heads = config.heads
+        self.norm = nn.LayerNorm(d)
+        self.query = nn.Linear(d, d)
+        self.key = nn.Linear(d, d)
+        self.value = nn.Linear(d, d)
+        self.norm2 = nn.LayerNorm(2 * d)
+        last = nn.Linear(2 * d, d)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.mlp = nn.Sequential(nn.Linear(2 * d, 2 * d), nn.GELU(), last)
+
+    def forward(self, s: Tensor, group: int) -> Tensor:
+        # s (G * group, M, d): clouds of one object are neighbours
+        B, M, d = s.shape
+        n = self.norm(s).reshape(B // group, group * M, d)
+        q, k, v = (
+            f(n).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+            for f in (self.query, self.key, self.value)
+        )  # (G, h, group * M, width)
+        cloud = torch.arange(group, device=s.device).repeat_interleave(M)
+        others = cloud[:, None] != cloud
+        message = nn.functional.scaled_dot_product_attention(q, k, v, attn_mask=others)
+        message = message.transpose(1, 2).reshape(B, M, d).to(s.dtype)
+        return s + self.mlp(self.norm2(torch.cat((s, message), -1)))
+
+
 class DescriptorNet(nn.Module):
-    """Clouds (B, P, 3) and node indices (B, M) -> unit descriptors (B, M, D)."""
+    """Clouds (B, P, 3) and node indices (B, M) -> unit descriptors (B, M, D).
+
+    `group` clouds that follow each other show the same object and are described together.
+    """
 
     def __init__(self, config: DescriptorConfig):
         super().__init__()
         self.config = config
         self.local = LocalMoments(config)
         self.layers = nn.ModuleList(ContextLayer(config) for _ in range(config.layers))
+        crossings = config.layers - 1 if config.cross else 0
+        self.cross = nn.ModuleList(CrossLayer(config) for _ in range(crossings))
         self.head = nn.Sequential(
             nn.LayerNorm(config.scalars), nn.Linear(config.scalars, config.descriptor)
         )
@@ -195,7 +241,7 @@ class DescriptorNet(nn.Module):
         scale = (points - centre).square().sum(-1).mean(1).sqrt().clamp_min(1e-4)
         return (points - centre) / scale[:, None, None], centre, scale
 
-    def forward(self, points: Tensor, nodes: Tensor) -> Tensor:
+    def forward(self, points: Tensor, nodes: Tensor, group: int = 1) -> Tensor:
         cfg = self.config
         x, _, _ = self.normalise(points)
         p = torch.gather(x, 1, nodes[..., None].expand(-1, -1, 3))  # (B, M, 3)
@@ -206,7 +252,9 @@ class DescriptorNet(nn.Module):
         unit = relative / (length + 0.02)
         centres = torch.linspace(0, 3.0, cfg.distance_bases, device=p.device, dtype=p.dtype)
         bases = torch.exp(-((length - centres) ** 2) / (2 * 0.3**2))
-        for layer in self.layers:
+        for k, layer in enumerate(self.layers):
+            if k and self.cross and group > 1:
+                s = self.cross[k - 1](s, group)
             s, v = layer(s, v, bases, unit, relative)
         return nn.functional.normalize(self.head(s), dim=-1)
 

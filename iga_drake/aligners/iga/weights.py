@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from iga_drake.aligners.checkpoint import CheckpointError, load_checkpoint
+from iga_drake.checkpoint import CheckpointError, load_checkpoint
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
 
 DESCRIPTOR = "descriptor"
@@ -12,6 +12,7 @@ def descriptor_config(card: dict) -> DescriptorConfig:
     """The network's sizes as saved in a model card."""
     fields = dict(card["model"])
     fields["shells"] = tuple(fields["shells"])
+    fields.setdefault("cross", False)  # checkpoints from before there was any
     return DescriptorConfig(**fields)
 
 

@@ -52,6 +52,41 @@ def test_tells_left_from_right(net: DescriptorNet, cloud) -> None:
     assert (net(points * mirror, nodes) - net(points, nodes)).abs().max() > 1e-3
 
 
+@pytest.fixture(scope="module")
+def crossing() -> DescriptorNet:
+    """A network whose cross layers, the identity at first, do something."""
+    torch.manual_seed(0)
+    net = DescriptorNet(DescriptorConfig(layers=3)).double()
+    for layer in net.cross:
+        torch.nn.init.normal_(layer.mlp[2].weight, std=0.1)
+    return net
+
+
+def test_clouds_described_together_move_separately(crossing: DescriptorNet, cloud) -> None:
+    points, nodes = cloud
+    R = random_rotations(4, generator=torch.Generator().manual_seed(2))
+    moved = points @ R.transpose(1, 2) + torch.randn(4, 1, 3, dtype=torch.float64)
+    together = crossing(points, nodes, group=4)
+    torch.testing.assert_close(crossing(moved, nodes, group=4), together, atol=1e-6, rtol=0)
+    order = torch.tensor([2, 0, 3, 1])
+    torch.testing.assert_close(crossing(points[order], nodes[order], group=4), together[order])
+
+
+def test_a_cloud_is_described_by_its_own_group_alone(crossing: DescriptorNet, cloud) -> None:
+    points, nodes = cloud
+    pairs = crossing(points, nodes, group=2)
+    assert (pairs - crossing(points, nodes)).abs().max() > 1e-3
+    changed = points.clone()
+    changed[3] *= torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64)
+    again = crossing(changed, nodes, group=2)
+    torch.testing.assert_close(again[:2], pairs[:2], atol=0, rtol=0)
+    assert (again[2] - pairs[2]).abs().max() > 1e-4
+
+
+def test_cross_layers_start_as_the_identity(net: DescriptorNet, cloud) -> None:
+    torch.testing.assert_close(net(*cloud, group=4), net(*cloud))
+
+
 def test_gradients_match_finite_differences() -> None:
     torch.manual_seed(0)
     small = DescriptorNet(DescriptorConfig(layers=1, scalars=8, vectors=4, heads=2)).double()

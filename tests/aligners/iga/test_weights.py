@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from iga_drake.aligners.checkpoint import CheckpointError, save_checkpoint
+from iga_drake.checkpoint import CheckpointError, save_checkpoint
 from iga_drake.aligners.iga.aligner import IgaAligner
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
 from iga_drake.aligners.iga.weights import DESCRIPTOR, load_descriptor

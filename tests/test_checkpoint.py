@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from iga_drake.aligners.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from iga_drake.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 
 TENSORS = {"a": torch.arange(6.0).reshape(2, 3), "b": torch.tensor([1, 2], dtype=torch.uint8)}
 

@@ -1,0 +1,87 @@
+"""`iga dataset`: writes the samples of a set to files, and prints digests of sets."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from iga_drake.errors import IgaDrakeError
+
+
+class DatasetCommandError(IgaDrakeError):
+    """A dataset command was asked for something that it can't do."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `iga dataset`."""
+    kinds = parser.add_subparsers(dest="kind", required=True)
+    export = kinds.add_parser("export", help="write samples as safetensors shards; resumes")
+    _add_set(export)
+    export.add_argument("--out", type=Path, required=True, metavar="DIR")
+    export.add_argument("--shard-size", type=int, default=256, help="samples a file (default 256)")
+    export.add_argument("--jobs", type=int, default=1, help="processes; -1: all cores (default 1)")
+    export.add_argument(
+        "--ray", nargs="?", const="", metavar="ADDRESS",
+        help="on a Ray cluster; without address: the local one, started if need be",
+    )  # fmt: skip
+    digest = kinds.add_parser("digest", help="print one SHA-256 over the first samples of a set")
+    _add_set(digest)
+    digest.add_argument("--workers", type=int, default=0, help="processes; 0: this one (default)")
+
+
+def _add_set(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--set", "--split", dest="split", required=True, metavar="NAME")
+    parser.add_argument("--count", type=int, metavar="N", help="samples (default: all of the set)")
+
+
+def main(arguments: argparse.Namespace) -> int:
+    """Runs `iga dataset`; returns the exit status. Raises `IgaDrakeError` for bad input."""
+    return {"export": _export, "digest": _digest}[arguments.kind](arguments)
+
+
+def _count(arguments: argparse.Namespace) -> int:
+    """How many samples are meant; checks the set's name and size."""
+    from iga_drake.dataset.splits import sample_set
+
+    size = sample_set(arguments.split).count
+    count = size if arguments.count is None else arguments.count
+    if count is None:
+        raise DatasetCommandError(f"--count: needed, the set '{arguments.split}' has no end")
+    if count < 1 or (size is not None and count > size):
+        most = "or more" if size is None else f"to {size}"
+        raise DatasetCommandError(f"--count {count}: 1 {most} samples of '{arguments.split}'")
+    return count
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    count = _count(arguments)
+    from iga_drake.dataset.export import export_shards
+
+    def show(done: int, total: int) -> None:
+        print(f"{done} of {total} shards", file=sys.stderr, flush=True)
+
+    result = export_shards(
+        arguments.split,
+        count,
+        arguments.out,
+        shard_size=arguments.shard_size,
+        jobs=arguments.jobs,
+        backend="loky" if arguments.ray is None else "ray",
+        address=arguments.ray or None,
+        progress=show,
+    )
+    print(
+        f"{result.manifest}: {count} samples of '{arguments.split}', {result.made} shards made, "
+        f"{result.kept} kept"
+    )
+    return 0
+
+
+def _digest(arguments: argparse.Namespace) -> int:
+    count = _count(arguments)
+    if arguments.workers < 0:
+        raise DatasetCommandError(f"--workers {arguments.workers}: 0 or more are needed")
+    from iga_drake.dataset.export import set_digest
+
+    value = set_digest(arguments.split, count, workers=arguments.workers)
+    print(f"{value}  {arguments.split} 0-{count - 1}")
+    return 0

@@ -1,0 +1,1 @@
+"""Makes the checks beside this file importable from the folders below."""
