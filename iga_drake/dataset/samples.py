@@ -14,11 +14,13 @@ from functools import cache
 import numpy as np
 import torch
 
+from iga_drake.dataset.collections import collection_keys, collection_mesh
 from iga_drake.dataset.depth_camera import Clouds, DepthNoise, observe
 from iga_drake.dataset.splits import SampleSet, family_names, sample_set
 from iga_drake.shapes.composite import CompositeCategory
 from iga_drake.shapes.deformers import DeformableShape, Deformer, LatticeDeformer, PartDeformer
 from iga_drake.shapes.families import FAMILIES
+from iga_drake.shapes.surfaces import Surface
 from iga_drake.shapes.symmetry import NO_SYMMETRY, Symmetry
 
 COMPOSITE = "composite"
@@ -40,6 +42,10 @@ class SampleConfig:
     deformations: tuple[float, float, float, float] = (0.25, 0.35, 0.2, 0.2)
     joint_share: float = 0.4  # of the samples: both objects in view hide parts of each other
     least_seen: int = 64  # occupied voxels of a cloud
+    # A collection of meshes (folder, ShapeNetCore.v2, package) that objects are drawn from instead,
+    # and the share of the objects that are.
+    meshes: str = ""
+    mesh_share: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -82,7 +88,7 @@ def make_sample(split: str, index: int, config: SampleConfig | None = None) -> S
     """Sample `index` of the set `split` of splits.yaml. Raises `SplitError` for an unknown set."""
     config = config or SampleConfig()
     chosen = sample_set(split)
-    k = _stream_index(chosen, index)
+    k = _stream_index(chosen, index, config)
     objects = [_instances(chosen, k, role, config) for role in range(2)]
     modes = [_Alignment(chosen, k, mode, objects, config) for mode in range(chosen.modes)]
     attempt = 0
@@ -93,40 +99,49 @@ def make_sample(split: str, index: int, config: SampleConfig | None = None) -> S
         attempt += 1
 
 
-def category_names(chosen: SampleSet, k: int) -> tuple[str, str]:
+def category_names(
+    chosen: SampleSet, k: int, config: SampleConfig | None = None
+) -> tuple[str, str]:
     """Names of A's and B's categories at index k of the set's streams."""
-    return _category(chosen, k, 0)[0], _category(chosen, k, 1)[0]
+    config = config or SampleConfig()
+    return _category(chosen, k, 0, config)[0], _category(chosen, k, 1, config)[0]
 
 
-def _category(chosen: SampleSet, k: int, role: int) -> tuple[str, np.random.Generator]:
+def _category(
+    chosen: SampleSet, k: int, role: int, config: SampleConfig
+) -> tuple[str, np.random.Generator]:
     """The category's name and the generator that draws a composite's structure."""
     rng = chosen.rng("categories", k, role)
-    if rng.random() < chosen.composite_share:
+    if config.meshes and rng.random() < config.mesh_share:
+        names = collection_keys(config.meshes, chosen.families)
+    elif rng.random() < chosen.composite_share:
         return COMPOSITE, rng
-    names = family_names(chosen.families)
+    else:
+        names = family_names(chosen.families)
     return names[int(rng.integers(len(names)))], rng
 
 
 def _symmetry(category: str) -> Symmetry:
-    return NO_SYMMETRY if category == COMPOSITE else FAMILIES[category].symmetry
+    """Of a family; nothing is known of composites and meshes."""
+    return FAMILIES[category].symmetry if category in FAMILIES else NO_SYMMETRY
 
 
 @cache
-def _kept(name: str) -> list[int]:
+def _kept(name: str, config: SampleConfig) -> list[int]:
     """Stream indices found so far that a set without symmetric families keeps."""
     return []
 
 
-def _stream_index(chosen: SampleSet, index: int) -> int:
+def _stream_index(chosen: SampleSet, index: int, config: SampleConfig) -> int:
     """Where the set's streams hold sample `index`."""
     if index < 0:
         raise IndexError(f"sample {index} of '{chosen.name}': the first is 0")
     if chosen.symmetric:
         return index
-    kept = _kept(chosen.name)
+    kept = _kept(chosen.name, config)
     k = kept[-1] + 1 if kept else 0
     while len(kept) <= index:
-        symmetries = [_symmetry(name) for name in category_names(chosen, k)]
+        symmetries = [_symmetry(name) for name in category_names(chosen, k, config)]
         if all(s.is_trivial or not s.exact for s in symmetries):
             kept.append(k)
         k += 1
@@ -145,7 +160,7 @@ def _meshes(
 ) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
     """The category, vertices (N + 1, V, 3) m of its instances, faces (F, 3), and the symmetry axis
     (2, 3) of the test pair's instance."""
-    category, structure = _category(chosen, k, role)
+    category, structure = _category(chosen, k, role, config)
     base = chosen.rng("instances", k, role)
     each = [chosen.rng("instances", k, role, n) for n in range(chosen.pairs + 1)]
     levels = np.full(chosen.pairs + 1, base.uniform(*chosen.variation))
@@ -166,7 +181,7 @@ def _meshes(
             composite.instance(rng, 0.28 * spread)
             for rng, spread in zip(each, spreads, strict=True)
         ]
-    else:
+    elif category in FAMILIES:
         family = FAMILIES[category]
         product = family.sample_parameters(base)
         surfaces = []
@@ -177,6 +192,9 @@ def _meshes(
             elif spread:
                 parameters = family.vary_parameters(product, rng, 0.5 * spread)
             surfaces.append(family.surface(parameters))
+    else:  # the instances of a mesh are its deformations
+        surfaces = [Surface(*collection_mesh(config.meshes, category))] * len(each)
+        deformation = "lattice" if deformation == "none" else deformation
     vertices, faces = np.stack([surface[0] for surface in surfaces]), surfaces[0][1]
     rest = vertices[-1].copy()
     same = DeformableShape(vertices[0], faces)
@@ -212,8 +230,8 @@ def _deformer(kind: str, level: float, cells: int) -> Deformer | None:
 
 def canonical_mesh(split: str, index: int, role: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) m and faces (F, 3) of a sample's canonical A (role 0) or B (role 1)."""
-    chosen = sample_set(split)
-    _, vertices, faces, _ = _meshes(chosen, _stream_index(chosen, index), role, SampleConfig())
+    chosen, config = sample_set(split), SampleConfig()
+    _, vertices, faces, _ = _meshes(chosen, _stream_index(chosen, index, config), role, config)
     return vertices[0], faces
 
 

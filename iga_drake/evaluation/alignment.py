@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from iga_drake.checkpoint import load_checkpoint
 from iga_drake.aligners.iga.weights import DESCRIPTOR
 from iga_drake.aligners.protocol import Aligner, Alignment
+from iga_drake.checkpoint import load_checkpoint
 from iga_drake.dataset.oracle import oracle_pose
 from iga_drake.dataset.samples import Sample, SampleConfig, make_sample
 from iga_drake.dataset.splits import sample_sets

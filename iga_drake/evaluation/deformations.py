@@ -15,12 +15,15 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from iga_drake.evaluation.shape_sheets import canonical_colors, contact_sheet, write_png
-from iga_drake.shapes.deformers.dif_net import DifNetDeformer
+from iga_drake.shapes.deformers import LatticeDeformer, PartDeformer, ReinstancingDeformer
+from iga_drake.shapes.deformers.dif_net import DifNetDeformer, default_weights
 from iga_drake.shapes.deformers.protocol import DeformableShape, Deformer
 from iga_drake.shapes.dif_net import DifNet, Normalisation, load_dif_net
 from iga_drake.shapes.families import FAMILIES
 from iga_drake.shapes.instance import ShapeError
 from iga_drake.training.dif_net import DifNetTraining, training_shapes
+
+DEFORMERS = ("dif-net", "lattice", "parts", "reinstancing")
 
 
 @dataclass(frozen=True)
@@ -163,17 +166,18 @@ def deformation_sheet(
     return contact_sheet([(mesh, faces, colors) for mesh in meshes], columns=columns)
 
 
-def dif_net_sheet(
-    family_name: str,
-    count: int = 24,
-    seed: int = 0,
-    *,
-    scale: float = 1.0,
-    weights: Path | None = None,
-) -> np.ndarray:
-    """`deformation_sheet` of a `DifNetDeformer` (default: the package's weights)."""
+def make_deformer(name: str, scale: float, weights: Path | None = None) -> Deformer:
+    """One of DEFORMERS, `scale` times as strong as by default; `weights` are DIF-Net's."""
+    if name == "lattice":
+        return LatticeDeformer(amplitude=0.06 * scale, scale=0.2 * scale)
+    if name == "parts":
+        return PartDeformer(
+            scale=0.2 * scale, bend=0.1 * scale, taper=0.15 * scale, common=0.1 * scale
+        )
+    if name == "reinstancing":
+        return ReinstancingDeformer(spread=0.15 * scale)
     net = None if weights is None else load_dif_net(weights)[0]
-    return deformation_sheet(DifNetDeformer(net, scale=scale), family_name, count, seed)
+    return DifNetDeformer(net, scale=scale)
 
 
 def add_view_deformations(parser: argparse.ArgumentParser) -> None:
@@ -184,21 +188,41 @@ def add_view_deformations(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--count", type=int, default=24)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--scale", type=float, default=1.0, help="of the displacement")
-    parser.add_argument("--weights", type=Path, help="default: the package's")
+    parser.add_argument("--deformer", choices=DEFORMERS, default=DEFORMERS[0])
+    parser.add_argument("--scale", type=float, default=1.0, help="how strong, times the default")
+    parser.add_argument("--weights", type=Path, help="of DIF-Net (default: the package's)")
 
 
 def view_deformations(arguments: argparse.Namespace) -> int:
     """Writes one contact sheet a family."""
+    deformer = make_deformer(arguments.deformer, arguments.scale, arguments.weights)
     for name in arguments.family or ("mug", "bottle"):
-        path = arguments.out / f"{name}-deformed.png"
-        sheet = dif_net_sheet(
-            name,
-            arguments.count,
-            arguments.seed,
-            scale=arguments.scale,
-            weights=arguments.weights,
-        )
-        write_png(sheet, path)
+        path = arguments.out / f"{name}-{arguments.deformer}.png"
+        write_png(deformation_sheet(deformer, name, arguments.count, arguments.seed), path)
         print(f"written: {path}")
+    return 0
+
+
+def add_evaluate_deformations(parser: argparse.ArgumentParser) -> None:
+    """Options of `iga evaluate deformations`."""
+    parser.add_argument("--pairs", type=int, default=200, help="of training shapes, matched")
+    parser.add_argument("--draws", type=int, default=17, help="deformed instances a family")
+    parser.add_argument(
+        "--family", action="append", metavar="NAME",
+        help="repeatable (default: mug, bottle and hammer)",
+    )  # fmt: skip
+    parser.add_argument("--scale", type=float, action="append", help="repeatable (default: 1, 2)")
+    parser.add_argument("--weights", type=Path, help="of DIF-Net (default: the package's)")
+
+
+def evaluate_deformations(arguments: argparse.Namespace) -> int:
+    """Prints the errors of DIF-Net's correspondence and how many deformed meshes are valid."""
+    net, card = load_dif_net(arguments.weights or default_weights())
+    config = DifNetTraining(**card["training"])
+    print(f"correspondence, {correspondence_errors(net, config, pairs=arguments.pairs).row()}")
+    names = arguments.family or ["mug", "bottle", "hammer"]
+    for scale in arguments.scale or [1.0, 2.0]:
+        deformer = DifNetDeformer(net, scale=scale)
+        result = validity(deformer, names, arguments.draws)
+        print(f"validity, {', '.join(names)}, scale {scale:g}, {result.row()}", flush=True)
     return 0

@@ -1,5 +1,6 @@
 """Contact sheets: many shapes side by side in one picture, drawn by Drake's renderer."""
 
+import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -108,6 +109,27 @@ def shape_sheet(
     rng = np.random.default_rng(seed)
     shapes = [family.build(family.sample_parameters(rng)) for _ in range(count)]
     return contact_sheet(shapes, columns=columns, tile_px=tile_px)
+
+
+def add_view_shapes(parser: argparse.ArgumentParser) -> None:
+    """Options of `iga view shapes`."""
+    parser.add_argument(
+        "--family", action="append", metavar="NAME", help="repeatable (default: every family)"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--count", type=int, default=24, help="products a sheet (default 24)")
+    parser.add_argument("--seed", type=int, default=0)
+
+
+def view_shapes(arguments: argparse.Namespace) -> int:
+    """Writes one contact sheet a family; returns the exit status."""
+    if arguments.count < 1:
+        raise ShapeError(f"--count {arguments.count}: at least 1 is needed")
+    for name in arguments.family or FAMILIES:
+        path = arguments.out / f"{name}.png"
+        write_png(shape_sheet(name, arguments.count, arguments.seed), path)
+        print(f"written: {path}", flush=True)
+    return 0
 
 
 def write_png(image: np.ndarray, path: Path | str) -> None:

@@ -113,8 +113,7 @@ def _read(arguments: argparse.Namespace) -> int:
     from iga_drake.shapes.readers import (
         PACKAGES,
         ReadReport,
-        list_folder,
-        list_package,
+        list_collection,
         list_shapenet,
         read_meshes,
         split_of,
@@ -123,15 +122,12 @@ def _read(arguments: argparse.Namespace) -> int:
     if arguments.count is not None and arguments.count < 1:
         raise ShapeError(f"--count {arguments.count}: at least 1 is needed")
     cleaning = MeshCleaning(scale=arguments.scale, extent=arguments.extent, faces=arguments.faces)
-    source = Path(arguments.source)
-    if arguments.source in PACKAGES and not source.is_dir():
-        if arguments.category:
+    if arguments.category:
+        if arguments.source in PACKAGES:
             raise ShapeError("--category: a package has none to choose; leave it out")
-        entries = list_package(arguments.source)
-    elif (source / "taxonomy.json").is_file() or arguments.category:
-        entries = list_shapenet(source, categories=arguments.category)
+        entries = list_shapenet(arguments.source, categories=arguments.category)
     else:
-        entries = list_folder(source)
+        entries = list_collection(arguments.source)
     report = ReadReport()
     for shape in read_meshes(entries[: arguments.count], cleaning=cleaning, report=report):
         size = " x ".join(f"{extent:.4g}" for extent in np.ptp(shape.vertices, axis=0))

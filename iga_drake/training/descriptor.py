@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from iga_drake.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
 from iga_drake.aligners.iga.weights import DESCRIPTOR as KIND
 from iga_drake.aligners.iga.weights import descriptor_config
+from iga_drake.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from iga_drake.dataset.loader import sample_loader
 from iga_drake.dataset.samples import SampleConfig
 from iga_drake.geometry.clouds import furthest_point_sampling

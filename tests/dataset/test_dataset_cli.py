@@ -37,7 +37,7 @@ def test_digest_prints_the_set_s_digest(capsys: pytest.CaptureFixture) -> None:
     value, where = capsys.readouterr().out.split("  ")
     assert where == "easy 0-1\n"
     assert value == set_digest("easy", 2)
-    assert run("digest", "--split", "easy", "--count", "3") == 0
+    assert run("digest", "--set", "easy", "--count", "3") == 0
     assert capsys.readouterr().out.split()[0] != value
 
 

@@ -149,7 +149,8 @@ def test_a_symmetry_axis_lies_where_the_object_is_symmetric() -> None:
             symmetry = FAMILIES[categories[role]].symmetry
             if symmetry.order != 0 or not symmetry.exact:
                 continue
-            sample = make_sample("validation", index, SampleConfig(deformations=(1.0, 0.0, 0.0, 0.0)))
+            undeformed = SampleConfig(deformations=(1.0, 0.0, 0.0, 0.0))
+            sample = make_sample("validation", index, undeformed)
             cloud = sample.points[role, -1].astype(float)
             point, direction = sample.axes[role]
             arm = cloud - point

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from iga_drake.checkpoint import load_checkpoint
 from iga_drake.aligners.iga.aligner import default_weights
 from iga_drake.aligners.protocol import PoseEstimate
+from iga_drake.checkpoint import load_checkpoint
 from iga_drake.dataset.samples import make_sample
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.alignment import (

@@ -143,7 +143,7 @@ def run(*arguments: str) -> int:
 
 def test_the_command_writes_a_page_and_a_sheet(tmp_path: Path, capsys: pytest.CaptureFixture):
     png, page = tmp_path / "new" / "sheet.png", tmp_path / "new" / "page.html"
-    assert run("--split", "train", "--index", "3", "--png", str(png), "--html", str(page)) == 0
+    assert run("--set", "train", "--index", "3", "--png", str(png), "--html", str(page)) == 0
     assert png.read_bytes().startswith(b"\x89PNG")
     assert page.read_text().lstrip().lower().startswith("<!doctype html>")
     printed = capsys.readouterr().out
@@ -160,17 +160,17 @@ def test_the_command_takes_consecutive_samples(monkeypatch: pytest.MonkeyPatch, 
 
     monkeypatch.setattr(dataset_views, "make_sample", sample)
     page = tmp_path / "page.html"
-    assert run("--split", "easy", "--index", "998", "--count", "2", "--html", str(page)) == 0
+    assert run("--set", "easy", "--index", "998", "--count", "2", "--html", str(page)) == 0
     assert asked == [("easy", 998), ("easy", 999)]
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--split", "nothing"], "train"),
+        (["--set", "nothing"], "train"),
         (["--index", "-1"], "at least 0"),
         (["--count", "0"], "at least"),
-        (["--split", "easy", "--index", "999", "--count", "2"], "sample 1000 asked of 'easy'"),
+        (["--set", "easy", "--index", "999", "--count", "2"], "sample 1000 asked of 'easy'"),
         (["--png", "sheet.jpg"], r"\.png"),
         (["--png", "sheet.png", "--count", "31"], "write several"),
     ],

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import torch
 
-from iga_drake.checkpoint import load_checkpoint
 from iga_drake.aligners.iga.descriptor import DescriptorConfig
 from iga_drake.aligners.iga.weights import load_descriptor
+from iga_drake.checkpoint import load_checkpoint
 from iga_drake.dataset.samples import SampleConfig
 from iga_drake.training.descriptor import DescriptorTraining, train_descriptor, validate
 

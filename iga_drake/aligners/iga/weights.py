@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from iga_drake.checkpoint import CheckpointError, load_checkpoint
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
+from iga_drake.checkpoint import CheckpointError, load_checkpoint
 
 DESCRIPTOR = "descriptor"
 

@@ -8,7 +8,6 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
-from scipy.interpolate import BSpline
 
 from iga_drake.shapes.family import Draft
 from iga_drake.shapes.instance import ShapeError
@@ -36,6 +35,8 @@ def stations(count: int) -> np.ndarray:
 
 @lru_cache(maxsize=128)
 def _spline_basis(controls: int, count: int) -> np.ndarray:
+    from scipy.interpolate import BSpline  # takes long to import
+
     degree = min(3, controls - 1)
     inner = np.linspace(0.0, 1.0, controls - degree + 1)
     knots = np.concatenate([np.zeros(degree), inner, np.ones(degree)])

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from iga_drake.checkpoint import CheckpointError, save_checkpoint
 from iga_drake.aligners.iga.aligner import IgaAligner
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
 from iga_drake.aligners.iga.weights import DESCRIPTOR, load_descriptor
+from iga_drake.checkpoint import CheckpointError, save_checkpoint
 
 CONFIG = DescriptorConfig(layers=1, scalars=16, vectors=4, heads=2)
 
