@@ -49,6 +49,16 @@ def camera_info(intrinsics: Intrinsics) -> CameraInfo:
     return CameraInfo(k.width, k.height, k.fx, k.fy, k.cx, k.cy)
 
 
+def rendering_info(intrinsics: Intrinsics) -> CameraInfo:
+    """What Drake's renderer has to be given for images with these intrinsics.
+
+    It takes the first pixel's corner, not its centre, as (0, 0): without this, what is on the
+    optical axis appears half a pixel up and to the left (0.65 mm at 0.8 m).
+    """
+    k = intrinsics
+    return CameraInfo(k.width, k.height, k.fx, k.fy, k.cx + 0.5, k.cy + 0.5)
+
+
 def add_renderer(scene_graph: SceneGraph) -> None:
     """Adds the renderer that all cameras share; it needs no display."""
     params = RenderEngineVtkParams(
@@ -82,7 +92,7 @@ def add_camera(
     """
     core = RenderCameraCore(
         _RENDERER,
-        camera_info(camera.intrinsics),
+        rendering_info(camera.intrinsics),
         ClippingRange(0.01, 10.0),
         RigidTransform(),
     )

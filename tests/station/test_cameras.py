@@ -1,7 +1,23 @@
 import numpy as np
 import pytest
+from pydrake.geometry import (
+    GeometryInstance,
+    PerceptionProperties,
+    RenderLabel,
+    SceneGraph,
+    Sphere,
+)
+from pydrake.math import RigidTransform
+from pydrake.perception import DepthImageToPointCloud
+from pydrake.systems.framework import DiagramBuilder
 
-from iga_drake.station.cameras import camera_info, look_at, true_pose
+from iga_drake.station.cameras import (
+    add_camera,
+    add_renderer,
+    camera_info,
+    look_at,
+    true_pose,
+)
 from iga_drake.station.scenario import Camera, LookAt, Pose, Scenario
 
 # Shoulder of the Panda in W, and how far the hand's tip gets from it at most (m).
@@ -67,3 +83,33 @@ def test_default_cameras_see_the_work_area_from_above_and_out_of_reach():
         azimuths.append(np.degrees(np.arctan2(-to_center[1], -to_center[0])))
     gaps = np.diff(np.sort(azimuths), append=np.min(azimuths) + 360)
     assert gaps.max() < 160
+
+
+def test_a_rendered_image_back_projects_to_where_things_are():
+    """A ball's visible cap, seen straight on, is centred on the line of sight; Drake's own
+    back-projection says where its points lie."""
+    camera = Camera(pose=Pose(translation=[0.0, 0.0, 0.0], rpy=[0.0, 0.0, 0.0]))
+    camera.noise.enabled = False
+    builder = DiagramBuilder()
+    scene_graph = builder.AddSystem(SceneGraph())
+    add_renderer(scene_graph)
+    ball = GeometryInstance(RigidTransform([0.05, -0.03, 0.8]), Sphere(0.1), "ball")
+    properties = PerceptionProperties()
+    properties.AddProperty("label", "id", RenderLabel(1))
+    ball.set_perception_properties(properties)
+    scene_graph.RegisterAnchoredGeometry(scene_graph.RegisterSource("ball"), ball)
+    ports = add_camera(builder, scene_graph, name="camera", camera=camera, seed=(0,))
+    project = builder.AddSystem(DepthImageToPointCloud(camera_info(camera.intrinsics)))
+    builder.Connect(ports["depth_image"], project.depth_image_input_port())
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    cloud = project.point_cloud_output_port().Eval(project.GetMyContextFromRoot(context))
+    points = cloud.xyzs().T
+    points = points[np.isfinite(points).all(1) & (points[:, 2] < 1.0)]
+    assert len(points) > 5000
+    radius = np.linalg.norm(points - [0.05, -0.03, 0.8], axis=1)
+    assert abs(np.median(radius) - 0.1) < 2e-4  # the mesh of the ball is a little inside
+    # The fit of a sphere to the points finds the middle: half a pixel would be 0.65 mm.
+    A = np.column_stack((2 * points, np.ones(len(points))))
+    middle = np.linalg.lstsq(A, (points**2).sum(1), rcond=None)[0][:3]
+    np.testing.assert_allclose(middle, [0.05, -0.03, 0.8], atol=2e-4)
