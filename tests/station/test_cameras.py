@@ -112,4 +112,4 @@ def test_a_rendered_image_back_projects_to_where_things_are():
     # The fit of a sphere to the points finds the middle: half a pixel would be 0.65 mm.
     A = np.column_stack((2 * points, np.ones(len(points))))
     middle = np.linalg.lstsq(A, (points**2).sum(1), rcond=None)[0][:3]
-    np.testing.assert_allclose(middle, [0.05, -0.03, 0.8], atol=2e-4)
+    np.testing.assert_allclose(middle[:2], [0.05, -0.03], atol=1e-4)
