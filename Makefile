@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # The release that this was tested with; where pip would fetch CUDA with it, name a CPU build:
 # make TORCH=... (a version or a wheel). A newer Python gets the newest torch.
 TORCH ?= torch==2.13.0
-EXTRAS := icp,visuals,notebook,meshes,cluster,dif-net,dev
+EXTRAS := icp,visuals,notebook,meshes,cluster,train,dif-net,dev
 # Some releases add t64 to a package's name.
 PACKAGES := libglib2.0-0 libusb-1.0-0 libgl1 libegl1 libgl1-mesa-dri libgomp1 python3-venv
 

@@ -156,6 +156,12 @@ VIEWS = {
         "add_view_deformations",
         "view_deformations",
     ),
+    "energy": ("iga_drake.evaluation.energy_views", "add_view_energy", "view_energy"),
+    "reconstruction": (
+        "iga_drake.evaluation.encoder_views",
+        "add_view_reconstruction",
+        "view_reconstruction",
+    ),
 }
 
 
@@ -222,6 +228,13 @@ EVALUATIONS = {
         "add_evaluate_deformations",
         "evaluate_deformations",
     ),
+    "diagnosis": (
+        "iga_drake.evaluation.diagnosis",
+        "add_evaluate_diagnosis",
+        "evaluate_diagnosis",
+    ),
+    "scaling": ("iga_drake.evaluation.scaling", "add_evaluate_scaling", "evaluate_scaling"),
+    "diversity": ("iga_drake.evaluation.scaling", "add_evaluate_diversity", "evaluate_diversity"),
 }
 
 
@@ -400,7 +413,11 @@ COMMANDS: dict[str, tuple[str, Callable[[Any], None], Callable[[Any], int]]] = {
         _demonstrate,
     ),
     "view": ("look at demonstrations, shapes, samples, deformations", _add_view, _view),
-    "evaluate": ("tasks, alignments, deformations", _add_evaluate, _evaluate),
+    "evaluate": (
+        "tasks, alignments and where their errors come from, deformations",
+        _add_evaluate,
+        _evaluate,
+    ),
     "benchmark": ("time a part", _add_benchmark, _benchmark),
     "shapes": ("list families, write them as SDF, read meshes", _add_nothing, _shapes),
     "dataset": ("write samples to files, print their digests", _add_nothing, _dataset),

@@ -88,7 +88,7 @@ def make_sample(split: str, index: int, config: SampleConfig | None = None) -> S
     """Sample `index` of the set `split` of splits.yaml. Raises `SplitError` for an unknown set."""
     config = config or SampleConfig()
     chosen = sample_set(split)
-    k = _stream_index(chosen, index, config)
+    k = stream_index(chosen, index, config)
     objects = [_instances(chosen, k, role, config) for role in range(2)]
     modes = [_Alignment(chosen, k, mode, objects, config) for mode in range(chosen.modes)]
     attempt = 0
@@ -132,7 +132,7 @@ def _kept(name: str, config: SampleConfig) -> list[int]:
     return []
 
 
-def _stream_index(chosen: SampleSet, index: int, config: SampleConfig) -> int:
+def stream_index(chosen: SampleSet, index: int, config: SampleConfig) -> int:
     """Where the set's streams hold sample `index`."""
     if index < 0:
         raise IndexError(f"sample {index} of '{chosen.name}': the first is 0")
@@ -150,12 +150,12 @@ def _stream_index(chosen: SampleSet, index: int, config: SampleConfig) -> int:
 
 def _instances(chosen: SampleSet, k: int, role: int, config: SampleConfig) -> _Object:
     """The canonical instance of a category and N instances around it."""
-    category, vertices, faces, axis = _meshes(chosen, k, role, config)
+    category, vertices, faces, axis = instance_meshes(chosen, k, role, config)
     rng = chosen.rng("instances", k, role, chosen.pairs + 1)
     return _Object(category, *surface_points(rng, vertices, faces, config.surface_points), axis)
 
 
-def _meshes(
+def instance_meshes(
     chosen: SampleSet, k: int, role: int, config: SampleConfig
 ) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
     """The category, vertices (N + 1, V, 3) m of its instances, faces (F, 3), and the symmetry axis
@@ -231,7 +231,9 @@ def _deformer(kind: str, level: float, cells: int) -> Deformer | None:
 def canonical_mesh(split: str, index: int, role: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) m and faces (F, 3) of a sample's canonical A (role 0) or B (role 1)."""
     chosen, config = sample_set(split), SampleConfig()
-    _, vertices, faces, _ = _meshes(chosen, _stream_index(chosen, index, config), role, config)
+    _, vertices, faces, _ = instance_meshes(
+        chosen, stream_index(chosen, index, config), role, config
+    )
     return vertices[0], faces
 
 

@@ -17,16 +17,16 @@ from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from iga_drake.aligners.iga.weights import DESCRIPTOR
-from iga_drake.aligners.protocol import Aligner, Alignment
+from iga_drake.aligners.protocol import Aligner
+from iga_drake.aligners.query import Query
 from iga_drake.checkpoint import load_checkpoint
+from iga_drake.dataset.alignment_error import CONFIG, equivalents, nearest_error, random_pose
 from iga_drake.dataset.oracle import oracle_pose
-from iga_drake.dataset.samples import Sample, SampleConfig, make_sample
+from iga_drake.dataset.samples import make_sample
 from iga_drake.dataset.splits import sample_sets
 from iga_drake.errors import IgaDrakeError
-from iga_drake.shapes.symmetry import Symmetry
 
 FIVE_SETS = (
     "seen_alignments",
@@ -37,8 +37,6 @@ FIVE_SETS = (
 )
 ORACLE = "oracle"
 THRESHOLDS = ((0.01, 5.0), (0.02, 10.0), (0.03, 15.0))  # m, deg
-# Observed clouds of the evaluation sets are denser than those of training.
-CONFIG = SampleConfig(cloud_points=512)
 
 
 @dataclass(frozen=True)
@@ -120,60 +118,9 @@ HEADER = (
 )
 
 
-def random_pose(index: int) -> np.ndarray:
-    """A Haar-random start pose (4, 4), the same for every aligner."""
-    rng = np.random.default_rng([7, index])
-    X = np.eye(4)
-    X[:3, :3] = Rotation.random(rng=rng).as_matrix()
-    X[:3, 3] = rng.normal(size=3) * 0.3
-    return X
-
-
-def pose_errors(estimate: np.ndarray, truth: np.ndarray, cloud: np.ndarray) -> tuple[float, float]:
-    """Centroid distance (m) and angle (rad) between two poses (4, 4) of a cloud (P, 3)."""
-    centre = np.append(cloud.mean(0), 1.0)
-    relative = estimate[:3, :3].T @ truth[:3, :3]
-    cosine = np.clip((np.trace(relative) - 1) / 2, -1, 1)
-    return float(np.linalg.norm((estimate - truth) @ centre)), float(np.arccos(cosine))
-
-
-def equivalents(sample: Sample, *, symmetry: bool) -> np.ndarray:
-    """(n, 4, 4) motions in W of the test pair's A that end in a valid alignment; with `symmetry`
-    also those that differ by the families' symmetries."""
-    motions = sample.modes
-    if not symmetry:
-        return motions
-    of_A, of_B = (
-        _turns(group, axis) for group, axis in zip(sample.symmetries, sample.axes, strict=True)
-    )
-    # B's symmetry turns what stands around it; A's turns A in its place.
-    motions = motions[:, None] @ of_A[None]
-    return (of_B[:, None, None] @ motions[None]).reshape(-1, 4, 4)
-
-
-def _turns(group: Symmetry, axis: np.ndarray) -> np.ndarray:
-    """(n, 4, 4) the group's rotations about an axis (2, 3), point and direction."""
-    point, direction = axis
-    X = np.tile(np.eye(4), (len(group.angles()), 1, 1))
-    X[:, :3, :3] = Rotation.from_rotvec(group.angles()[:, None] * direction).as_matrix()
-    X[:, :3, 3] = point - X[:, :3, :3] @ point
-    return X
-
-
-def nearest_error(motion: np.ndarray, valid: np.ndarray, cloud: np.ndarray) -> tuple[float, float]:
-    """Errors (m, rad) of a motion (4, 4) of a cloud (P, 3) against the one of `valid` (n, 4, 4)
-    that puts the cloud's points nearest to where the motion puts them."""
-    few = cloud[:: max(1, len(cloud) // 32)].astype(np.float64)
-    ends = few @ np.swapaxes(valid[:, :3, :3], 1, 2) + valid[:, None, :3, 3]
-    off = ends - (few @ motion[:3, :3].T + motion[:3, 3])
-    best = int(np.square(off).sum((1, 2)).argmin())
-    return pose_errors(motion, valid[best], cloud)
-
-
 def evaluate_sample(aligner: Aligner | None, split: str, index: int) -> SampleErrors | None:
     """Aligns one sample; without an aligner the oracle answers, or not (None)."""
     sample = make_sample(split, index, CONFIG)
-    N = sample.points.shape[1]
     test = sample.points[0, -1]
     began = time.perf_counter()
     if aligner is None:
@@ -181,12 +128,9 @@ def evaluate_sample(aligner: Aligner | None, split: str, index: int) -> SampleEr
         if motion is None:
             return None
     else:
-        context = tuple(Alignment(sample.points[0, n], sample.points[1, n]) for n in range(N - 1))
-        start = random_pose(index)
-        grasped = test @ start[:3, :3].T + start[:3, 3]
+        query = Query.of(sample.points, random_pose(index))
         began = time.perf_counter()
-        estimate = aligner.align(context, grasped, sample.points[1, -1], seed=index)
-        motion = estimate.poses[0] @ start
+        motion = query.motion(aligner.align(*query.clouds, seed=index))
     seconds = time.perf_counter() - began
     plain = nearest_error(motion, equivalents(sample, symmetry=False), test)
     modulo = nearest_error(motion, equivalents(sample, symmetry=True), test)

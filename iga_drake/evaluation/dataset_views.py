@@ -97,14 +97,12 @@ def sample_sheet(
         radii = _point_radii(points, sample.aligned)
         for n in range(points.shape[1]):
             tiles.append(
-                _balls(
-                    points[:, n].reshape(-1, 3), radii[:, n].ravel(), colors[:, n].reshape(-1, 3)
-                )
+                balls(points[:, n].reshape(-1, 3), radii[:, n].ravel(), colors[:, n].reshape(-1, 3))
             )
     return contact_sheet(tiles, columns=pairs.pop(), tile_px=tile_px)
 
 
-def _balls(
+def balls(
     centres: np.ndarray, radii: np.ndarray, colors: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (V, 3), faces (F, 3) and colours (V, 3) of a small ball at each distinct centre."""

@@ -4,10 +4,9 @@ Loss: for every ordered pair of instances of one object, cross-entropy between t
 each node and a soft target, a Gaussian in the canonical space (InfoNCE with soft positives).
 """
 
+import copy
 import dataclasses
-import json
-import subprocess
-import time
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,45 +14,75 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from iga_drake.aligners.iga.aligner import IgaAligner
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
 from iga_drake.aligners.iga.weights import DESCRIPTOR as KIND
 from iga_drake.aligners.iga.weights import descriptor_config
-from iga_drake.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from iga_drake.checkpoint import CheckpointError, load_checkpoint
 from iga_drake.dataset.loader import sample_loader
 from iga_drake.dataset.samples import SampleConfig
 from iga_drake.geometry.clouds import furthest_point_sampling
+from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
+from iga_drake.training.settings import TrainingError, replaced
+from iga_drake.training.validation import alignment_errors
 
 FEWER_PAIRS = 0.5  # of the steps use fewer than all pairs of a sample
+SEED_STRIDE = 10_000_000  # samples between the streams of two seeds
+WRONG = 3.0  # target sigmas from the true place, from where on a match counts as wrong
 
 
 @dataclass(frozen=True)
-class DescriptorTraining:
-    """One training run; saved with the weights."""
+class DescriptorTraining(RunConfig):
+    """One training run; saved with the weights. A sample has 2 objects of N instances."""
 
-    batch: int = 6  # samples of 2 objects x N instances
-    steps: int = 6000
-    learning_rate: float = 1.5e-3
-    warmup: int = 150
-    decay_share: float = 0.35  # of the steps, at the end: linear to zero
-    weight_decay: float = 0.02
-    clip: float = 1.0
-    ema: float = 0.998
     nodes: int = 64
     target_sigma: float = 0.05  # of the canonical size
     visible_within: float = 0.12  # a node counts where a true match is this near
-    bf16: bool = True  # autocast of the matrix products
-    seed: int = 0
+
+
+@dataclass(frozen=True)
+class DescriptorSettings:
+    """All that the result of a training depends on, but for the weights that it starts from."""
+
+    model: DescriptorConfig
+    training: DescriptorTraining
+    samples: SampleConfig
+
+    @staticmethod
+    def of(folder: Path) -> "DescriptorSettings":
+        """Those of the run in this folder, else the defaults. Raises `IgaDrakeError`."""
+        saved = SavedState.read(folder, KIND)
+        if saved is None:
+            return DescriptorSettings(DescriptorConfig(), DescriptorTraining(), SampleConfig())
+        return _saved_settings(saved, folder)
+
+
+def _saved_settings(saved: SavedState, folder: Path) -> DescriptorSettings:
+    where = f"{folder / 'state.safetensors'}"
+    return DescriptorSettings(
+        descriptor_config(saved.card),
+        replaced(DescriptorTraining(), saved.card["training"], f"{where}: training"),
+        replaced(SampleConfig(), saved.card["samples"], f"{where}: samples"),
+    )
 
 
 def correspondence_loss(
-    net: DescriptorNet, batch: dict[str, Tensor], config: DescriptorTraining
-) -> tuple[Tensor, dict[str, float]]:
-    """Loss and statistics: top-1 rate and the match error as a share of the canonical size."""
+    net: DescriptorNet,
+    batch: dict[str, Tensor],
+    config: DescriptorTraining,
+    start: Tensor | None = None,
+) -> Term:
+    """The cross-entropy of every node that has a true match, summed; mean logits of right and best
+    wrong matches, top-1 rate, and the match error as a share of the canonical size.
+
+    Nodes are sampled from the points `start` (clouds,) of the clouds on; default: at random.
+    """
     points = batch["points"].flatten(0, 2)
     canonical = batch["canonical"].flatten(0, 2)
     S, _, N = batch["points"].shape[:3]
-    start = torch.randint(points.shape[1], (len(points),), device=points.device)
-    nodes = furthest_point_sampling(points, config.nodes, start)
+    if start is None:
+        start = torch.randint(points.shape[1], (len(points),))
+    nodes = furthest_point_sampling(points, config.nodes, start.to(points.device))
     place = torch.gather(canonical, 1, nodes[..., None].expand(-1, -1, 3))
     M = config.nodes
     with torch.autocast(points.device.type, torch.bfloat16, enabled=config.bf16):
@@ -66,58 +95,48 @@ def correspondence_loss(
     cross_entropy = -(target * logits.log_softmax(-1)).sum(-1)  # (2S, N, M, N)
     other = ~torch.eye(N, dtype=torch.bool, device=points.device)[None, :, None, :]
     valid = (distance.amin(-1) < config.visible_within) & other
-    loss = cross_entropy[valid].mean()
     with torch.no_grad():
         best = logits.argmax(-1, keepdim=True)
         error = torch.gather(distance, -1, best)[..., 0][valid]
         hit = (best[..., 0] == distance.argmin(-1))[valid]
-    return loss, {
-        "loss": float(loss.detach()),
-        "top1": float(hit.float().mean()),
-        "error_mean": float(error.mean()),
-        "error_median": float(error.median()),
-    }
+        wrong = distance > WRONG * config.target_sigma
+        statistics = {
+            "top1": hit.float().mean(),
+            "error_mean": error.mean(),
+            "error_median": error.median(),
+            "positive_logit": (target * logits).sum(-1)[valid].mean(),
+            # Of nodes that have a wrong match to choose.
+            "negative_logit": logits.masked_fill(~wrong, -torch.inf)
+            .amax(-1)[valid & wrong.any(-1)]
+            .mean(),
+        }
+    return Term(cross_entropy[valid].sum(), valid.sum(), statistics)
 
 
-def _learning_rate(step: int, config: DescriptorTraining) -> float:
-    decay = max(1, int(config.decay_share * config.steps))
-    return config.learning_rate * min(
-        1.0, (step + 1) / config.warmup, max(0.02, (config.steps - step) / decay)
-    )
-
-
-def _some_pairs(batch: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The first pairs of a batch, two or more: any number of demonstrations will be asked for."""
-    N = batch["points"].shape[2]
+def _draw(shape: torch.Size, config: DescriptorTraining, world: int) -> tuple[int, Tensor]:
+    """Random choices of a step, the same in all processes: how many pairs (two or more: any number
+    of demonstrations will be asked for), and the first nodes (accumulate, world, clouds) of all."""
+    _, _, N, P = shape[:4]
     group = int(torch.randint(2, N + 1, ())) if torch.rand(()) < FEWER_PAIRS else N
-    return {name: values[:, :, :group] for name, values in batch.items()}
+    return group, torch.randint(P, (config.accumulate, world, config.batch * 2 * group))
 
 
 def validate(
     net: DescriptorNet, config: DescriptorTraining, samples: SampleConfig, *, split: str, count: int
 ) -> dict[str, float]:
-    """Mean statistics over the first `count` samples of a split."""
+    """Mean loss and statistics over the first `count` samples of a split."""
     device = next(net.parameters()).device
     rows = []
-    torch_state = torch.get_rng_state()
-    torch.manual_seed(0)
     net.eval()
-    with torch.no_grad():
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        torch.manual_seed(0)
         for batch in sample_loader(split, config=samples, batch=8, count=count):
             batch = {k: batch[k].to(device) for k in ("points", "canonical")}
-            rows.append(correspondence_loss(net, batch, config)[1])
-    torch.set_rng_state(torch_state)
+            term = correspondence_loss(net, batch, config)
+            values = {"loss": term.total / term.count} | term.statistics
+            rows.append({name: float(value) for name, value in values.items()})
     net.train()
     return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
-
-
-def _commit() -> str:
-    """The commit of the checkout that this package runs from; empty outside of one."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return ""
 
 
 def _take_over(net: DescriptorNet, tensors: dict[str, Tensor], path: Path) -> None:
@@ -131,6 +150,14 @@ def _take_over(net: DescriptorNet, tensors: dict[str, Tensor], path: Path) -> No
     net.load_state_dict(tensors, strict=False)
 
 
+def _alignment_errors(
+    weights: dict[str, Tensor], *, model: DescriptorConfig, count: int
+) -> dict[str, float]:
+    net = DescriptorNet(model)
+    net.load_state_dict(weights)
+    return alignment_errors(IgaAligner(net), count=count)
+
+
 def train_descriptor(
     output: Path,
     *,
@@ -138,126 +165,81 @@ def train_descriptor(
     config: DescriptorTraining | None = None,
     samples: SampleConfig | None = None,
     device: str = "cpu",
-    minutes: float = float("inf"),
     resume: bool = True,
     initial: Path | None = None,
-    checkpoint_every: int = 200,
-    stop_at: int | None = None,
     validation_count: int = 64,
     workers: int = 0,
+    options: RunOptions | None = None,
 ) -> dict:
-    """Trains until `config.steps`, `stop_at` or `minutes`; resumes from `output` where it can.
+    """Trains until `config.steps`, or as `options` say; resumes from `output` where it can.
 
-    Writes `output`/descriptor.safetensors (EMA weights), `output`/state.safetensors (all that
-    resuming needs) and `output`/log.jsonl. Returns the model card, which ends with the statistics
-    of the EMA weights over `validation_count` samples of the validation split.
+    Writes the files of `TrainingRun` to `output`. A resumed run keeps the settings of its state,
+    those that are given aside. Returns the model card, which ends with the statistics of the EMA
+    weights over `validation_count` samples of the validation split. Raises `IgaDrakeError`.
     """
-    config, samples = config or DescriptorTraining(), samples or SampleConfig()
-    state_path = output / "state.safetensors"
+    saved = SavedState.read(output, KIND) if resume else None
+    if saved is not None:
+        before = _saved_settings(saved, output)
+        if model not in (None, before.model):
+            raise TrainingError(
+                f"{output / 'state.safetensors'}: has another model than the one asked for "
+                f"({before.model}): train in another folder"
+            )
+        model, config, samples = before.model, config or before.training, samples or before.samples
+    model, config = model or DescriptorConfig(), config or DescriptorTraining()
+    samples = samples or SampleConfig()
     torch.manual_seed(config.seed)
-    step, seconds = 0, 0.0
-    tensors: dict[str, Tensor] = {}
-    if resume and state_path.is_file():
-        tensors, card = load_checkpoint(state_path, kind=KIND + "-state")
-        model = descriptor_config(card)
-        step, seconds = card["step"], card["seconds"]
-    net = DescriptorNet(model or DescriptorConfig()).to(device)
-    names = [name for name, _ in net.named_parameters()]
-    optimizer = torch.optim.AdamW(
-        net.parameters(),
-        lr=config.learning_rate,
-        weight_decay=config.weight_decay,
-        betas=(0.9, 0.98),
+    net = DescriptorNet(model).to(device)
+    if initial is not None and saved is None:
+        loaded, _ = load_checkpoint(initial, kind=KIND)
+        _take_over(net, loaded, initial)
+    run = TrainingRun(
+        output,
+        KIND,
+        net,
+        config,
+        saved=saved,
+        card={"model": dataclasses.asdict(model), "samples": dataclasses.asdict(samples)},
+        options=options,
+        validate=functools.partial(_alignment_errors, model=model, count=config.validation_samples),
     )
-    if tensors:
-        net.load_state_dict({n: tensors[f"net.{n}"] for n in names})
-        for name, parameter in net.named_parameters():
-            optimizer.state[parameter] = {
-                "step": torch.tensor(float(step)),
-                "exp_avg": tensors[f"m.{name}"].to(device),
-                "exp_avg_sq": tensors[f"v.{name}"].to(device),
-            }
-        ema = {n: tensors[f"ema.{n}"].to(device) for n in names}
-        torch.set_rng_state(tensors["rng"])
-    else:
-        if initial is not None:
-            loaded, _ = load_checkpoint(initial, kind=KIND)
-            _take_over(net, loaded, initial)
-        ema = {n: p.detach().clone() for n, p in net.named_parameters()}
-    output.mkdir(parents=True, exist_ok=True)
-    log = (output / "log.jsonl").open("a")
-    began = time.monotonic()
-    recent: list[dict] = []
-
-    def write() -> dict:
-        card = {
-            "model": dataclasses.asdict(net.config),
-            "training": dataclasses.asdict(config),
-            "samples": dataclasses.asdict(samples),
-            "step": step,
-            "samples_seen": step * config.batch,
-            "seconds": seconds + time.monotonic() - began,
-            "parameters": sum(p.numel() for p in net.parameters()),
-            "commit": _commit(),
-        }
-        save_checkpoint(output / "descriptor.safetensors", ema, kind=KIND, card=card)
-        state: dict[str, Tensor] = {f"net.{n}": p for n, p in net.named_parameters()}
-        state |= {f"ema.{n}": t for n, t in ema.items()}
-        for n, p in net.named_parameters():
-            # The last layer's vectors feed nothing: they have no gradient and no moments.
-            moments = optimizer.state.get(p, {})
-            state[f"m.{n}"] = moments.get("exp_avg", torch.zeros_like(p))
-            state[f"v.{n}"] = moments.get("exp_avg_sq", torch.zeros_like(p))
-        state["rng"] = torch.get_rng_state()
-        save_checkpoint(state_path, state, kind=KIND + "-state", card=card)
-        return card
-
     batches = iter(
         sample_loader(
             "train",
             config=samples,
             batch=config.batch,
-            first=config.seed * 10_000_000 + step * config.batch,
+            first=config.seed * SEED_STRIDE + run.samples_seen,
+            rank=run.ranks.rank,
+            world=run.ranks.world,
             workers=workers,
         )
     )
-    last = config.steps if stop_at is None else min(stop_at, config.steps)
-    while step < last and time.monotonic() - began < 60 * minutes:
-        whole = next(batches)
-        batch = _some_pairs({k: whole[k].to(device) for k in ("points", "canonical")})
-        for group in optimizer.param_groups:
-            group["lr"] = _learning_rate(step, config)
-        loss, row = correspondence_loss(net, batch, config)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(net.parameters(), config.clip)
-        optimizer.step()
-        step += 1
-        rate = min(config.ema, (1 + step) / (10 + step))
-        with torch.no_grad():
-            for name, parameter in net.named_parameters():
-                ema[name].lerp_(parameter, 1 - rate)
-        recent.append(row)
-        if step % 25 == 0:
-            mean = {key: float(np.mean([r[key] for r in recent])) for key in recent[0]}
-            mean |= {"step": step, "seconds": seconds + time.monotonic() - began}
-            log.write(json.dumps(mean) + "\n")
-            log.flush()
-            recent = []
-            if step % 100 == 0:
-                print(
-                    f"step {step}: loss {mean['loss']:.3f} top-1 {mean['top1']:.3f} match error "
-                    f"{100 * mean['error_median']:.1f} % of the size (median), "
-                    f"{step * config.batch / mean['seconds']:.1f} samples/s",
-                    flush=True,
-                )
-        if step % checkpoint_every == 0:
-            write()
-    card = write()
-    final = DescriptorNet(net.config).to(device)
-    final.load_state_dict(ema)
-    card["validation"] = validate(
-        final, config, samples, split="validation", count=validation_count
-    )
-    save_checkpoint(output / "descriptor.safetensors", ema, kind=KIND, card=card)
+    while run.goes_on():
+        # Networks that samples are made with may be built here, once a process, at random.
+        with torch.random.fork_rng(devices=[]):
+            parts = [next(batches) for _ in range(config.accumulate)]
+        group, start = _draw(parts[0]["points"].shape, config, run.ranks.world)
+        row = run.advance(
+            correspondence_loss(
+                net,
+                {k: part[k][:, :, :group].to(device) for k in ("points", "canonical")},
+                config,
+                first[run.ranks.rank],
+            )
+            for part, first in zip(parts, start, strict=True)
+        )
+        if row and run.ranks.first and run.step % (4 * config.log_every) == 0:
+            print(
+                f"step {run.step}: loss {row['loss']:.3f} top-1 {row['top1']:.3f} match error "
+                f"{100 * row['error_median']:.1f} % of the size (median), "
+                f"{row['samples_per_second']:.1f} samples/s",
+                flush=True,
+            )
+    card = run.save()
+    if run.ranks.first:
+        final = copy.deepcopy(net)
+        final.load_state_dict(run.ema)
+        scores = validate(final, config, samples, split="validation", count=validation_count)
+        card = run.save(validation=scores)
+    run.close()
     return card

@@ -16,13 +16,14 @@ from iga_drake.shapes.readers import split_of
 @pytest.fixture(scope="module")
 def meshes(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("meshes")
+    (folder / "things").mkdir()  # the category: part of the names that decide on the split
     rng = np.random.default_rng(0)
     for k in range(12):
         # A slab with a post off its middle: no symmetry.
         slab = trimesh.creation.box((0.1, 0.07, 0.02)).subdivide().subdivide()
         post = trimesh.creation.capsule(height=0.04 + 0.01 * k, radius=0.012)
         post.apply_translation((*rng.uniform(-0.03, 0.03, 2), 0))
-        trimesh.util.concatenate((slab, post)).export(folder / f"shape_{k}.stl")
+        trimesh.util.concatenate((slab, post)).export(folder / f"things/shape_{k}.stl")
     return folder
 
 

@@ -10,18 +10,16 @@ from scipy.spatial.transform import Rotation
 from iga_drake.aligners.iga.aligner import default_weights
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.checkpoint import load_checkpoint
-from iga_drake.dataset.samples import make_sample
-from iga_drake.errors import IgaDrakeError
-from iga_drake.evaluation.alignment import (
+from iga_drake.dataset.alignment_error import (
     CONFIG,
-    by_category,
     equivalents,
-    evaluate_alignment,
-    model_card,
     nearest_error,
     pose_errors,
     random_pose,
 )
+from iga_drake.dataset.samples import make_sample
+from iga_drake.errors import IgaDrakeError
+from iga_drake.evaluation.alignment import by_category, evaluate_alignment, model_card
 from iga_drake.shapes.families import FAMILIES
 
 

@@ -2,42 +2,121 @@
 
 from pathlib import Path
 
+import numpy as np
+import pytest
 import torch
+from descriptor_runs import assert_same, state
 
-from iga_drake.aligners.iga.descriptor import DescriptorConfig
+from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
 from iga_drake.aligners.iga.weights import load_descriptor
-from iga_drake.checkpoint import load_checkpoint
+from iga_drake.checkpoint import CheckpointError
 from iga_drake.dataset.samples import SampleConfig
-from iga_drake.training.descriptor import DescriptorTraining, train_descriptor, validate
+from iga_drake.training.descriptor import (
+    DescriptorSettings,
+    DescriptorTraining,
+    RunOptions,
+    correspondence_loss,
+    train_descriptor,
+    validate,
+)
+from iga_drake.training.settings import TrainingError
 
 MODEL = DescriptorConfig(scalars=24, vectors=8, heads=2, layers=2, descriptor=16)
 SAMPLES = SampleConfig(cloud_points=64, surface_points=400, least_seen=8)
 
 
 def _config(steps: int, **changes) -> DescriptorTraining:
-    return DescriptorTraining(steps=steps, batch=2, nodes=16, warmup=2, bf16=False, **changes)
+    options = {"batch": 2, "nodes": 16, "warmup": 2, "bf16": False}
+    return DescriptorTraining(steps=steps, **(options | changes))
 
 
-def _train(folder: Path, config: DescriptorTraining, **options) -> dict:
-    options.setdefault("validation_count", 2)
-    return train_descriptor(folder, model=MODEL, config=config, samples=SAMPLES, **options)
+def _train(folder: Path, config: DescriptorTraining | None, **options) -> dict:
+    options = {"model": MODEL, "samples": SAMPLES, "validation_count": 2} | options
+    return train_descriptor(folder, config=config, **options)
 
 
 def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
     _train(tmp_path / "whole", _config(6))
-    _train(tmp_path / "parts", _config(6), minutes=0.0)  # killed before its first step
-    _train(tmp_path / "parts", _config(6), checkpoint_every=3)
-    state, card = load_checkpoint(tmp_path / "parts" / "state.safetensors", kind="descriptor-state")
-    assert card["step"] == 6
-    # The checkpoint of step 3, as a kill at step 5 would leave it.
-    _train(tmp_path / "half", _config(6), stop_at=3)
-    card = _train(tmp_path / "half", _config(6))
+    _train(tmp_path / "parts", _config(6), options=RunOptions(minutes=0.0))  # before its first step
+    _train(tmp_path / "parts", _config(6), options=RunOptions(checkpoint_every=3))
+    _train(tmp_path / "half", _config(6), options=RunOptions(stop_at=4))
+    # Its settings are those of its state.
+    card = _train(tmp_path / "half", None, model=None, samples=None, workers=1)
     assert card["samples_seen"] == 12
-    whole, _ = load_checkpoint(tmp_path / "whole" / "state.safetensors", kind="descriptor-state")
-    half, _ = load_checkpoint(tmp_path / "half" / "state.safetensors", kind="descriptor-state")
-    for name in whole:
-        torch.testing.assert_close(half[name], whole[name], atol=0, rtol=0)
-        torch.testing.assert_close(state[name], whole[name], atol=0, rtol=0)
+    assert DescriptorSettings.of(tmp_path / "half") == DescriptorSettings(
+        MODEL, _config(6), SAMPLES
+    )
+    whole, card = state(tmp_path / "whole")
+    assert card["step"] == 6
+    for name in ("parts", "half"):
+        assert_same(whole, state(tmp_path / name)[0])
+
+
+def test_validating_changes_no_training(tmp_path: Path) -> None:
+    _train(tmp_path / "without", _config(4))
+    card = _train(tmp_path / "with", _config(4, validate_every=2, validation_samples=2))
+    assert_same(state(tmp_path / "without")[0], state(tmp_path / "with")[0])
+    assert card["errors"]["latest"]["step"] == 4
+    _net, best = load_descriptor(tmp_path / "with" / "best.safetensors")
+    assert best["step"] == best["errors"]["best"]["step"] == card["errors"]["best"]["step"]
+    errors = [card["errors"][name]["displacement_cm"] for name in ("best", "latest")]
+    assert 0 < errors[0] <= errors[1]
+
+
+@pytest.mark.parametrize(("batch", "accumulate"), [(2, 2), (1, 4)])
+def test_accumulated_gradients_are_those_of_one_batch(
+    tmp_path: Path, batch: int, accumulate: int
+) -> None:
+    """Of two steps that leave the weights alone: the first moments hold both gradients."""
+    still = {"learning_rate": 0.0, "weight_decay": 0.0}
+    _train(tmp_path / "one", _config(2, batch=4, **still))
+    _train(tmp_path / "parts", _config(2, batch=batch, accumulate=accumulate, **still))
+    one, card = state(tmp_path / "one")
+    parts, other = state(tmp_path / "parts")
+    assert card["samples_seen"] == other["samples_seen"] == 8
+    assert max(float(t.abs().max()) for n, t in one.items() if n.startswith("m.")) > 1e-3
+    for name, tensor in one.items():
+        if name.startswith("m."):  # a tenth of the gradient
+            torch.testing.assert_close(parts[name], tensor, atol=1e-7, rtol=0, msg=name)
+
+
+def test_the_loss_is_the_cross_entropy_of_the_visible_nodes() -> None:
+    """Against sums in loops, for every pair of instances."""
+    torch.manual_seed(3)
+    net, config = DescriptorNet(MODEL), _config(1, nodes=6, visible_within=0.3)
+    points, canonical = torch.randn(2, 2, 3, 20, 3), torch.rand(2, 2, 3, 20, 3)
+    with torch.no_grad():
+        term = correspondence_loss(net, {"points": points, "canonical": canonical}, config)
+        torch.manual_seed(4)
+        start = torch.randint(20, (12,))
+        term = correspondence_loss(net, {"points": points, "canonical": canonical}, config, start)
+        clouds, places = points.flatten(0, 2), canonical.flatten(0, 2)
+        from iga_drake.geometry.clouds import furthest_point_sampling
+
+        nodes = furthest_point_sampling(clouds, 6, start)
+        descriptors = net(clouds, nodes, group=3)
+        total, count, positive, negative = 0.0, 0, [], []
+        for i in range(12):
+            for j in range(12):
+                if i == j or i // 3 != j // 3:
+                    continue
+                logits = net.similarity(descriptors[i], descriptors[j]).double().numpy()
+                a, b = places[i, nodes[i]].numpy(), places[j, nodes[j]].numpy()
+                for node in range(6):
+                    d = np.linalg.norm(a[node] - b, axis=1)
+                    if d.min() >= 0.3:
+                        continue
+                    target = np.exp(-(d**2) / (2 * 0.05**2) + d.min() ** 2 / (2 * 0.05**2))
+                    target /= target.sum()
+                    total -= target @ (logits[node] - np.log(np.exp(logits[node]).sum()))
+                    count += 1
+                    positive.append(target @ logits[node])
+                    if (d > 0.15).any():
+                        negative.append(logits[node][d > 0.15].max())
+    assert int(term.count) == count > 50
+    assert float(term.total) == pytest.approx(total, rel=1e-4)
+    assert float(term.statistics["positive_logit"]) == pytest.approx(np.mean(positive), rel=1e-3)
+    assert float(term.statistics["negative_logit"]) == pytest.approx(np.mean(negative), rel=1e-3)
 
 
 def test_training_lowers_the_error_on_samples_it_has_not_seen(tmp_path: Path) -> None:
@@ -56,3 +135,13 @@ def test_training_lowers_the_error_on_samples_it_has_not_seen(tmp_path: Path) ->
     ]
     assert scores[1]["loss"] < scores[0]["loss"] - 0.1
     assert scores[1]["error_mean"] < scores[0]["error_mean"]
+
+
+def test_another_model_than_the_state_s_is_refused(tmp_path: Path) -> None:
+    _train(tmp_path, _config(1))
+    other = DescriptorConfig(scalars=48, vectors=8, heads=2, layers=2, descriptor=16)
+    with pytest.raises(TrainingError, match=r"state\.safetensors: has another model.*scalars=24"):
+        _train(tmp_path, _config(2), model=other)
+    weights = tmp_path / "descriptor.safetensors"
+    with pytest.raises(CheckpointError, match="does not fit this network"):
+        _train(tmp_path / "new", _config(2), model=other, initial=weights)

@@ -5,6 +5,8 @@ up to the choice of nodes, which furthest point sampling makes from the clouds' 
 """
 
 import copy
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,9 +15,10 @@ import torch
 from torch import Tensor
 
 from iga_drake.aligners.iga.descriptor import DescriptorNet
-from iga_drake.aligners.iga.voting import Match, VotingConfig, match_object, vote
+from iga_drake.aligners.iga.voting import Match, VotingConfig, cast_votes, match_object, modes
 from iga_drake.aligners.protocol import AlignerError, Alignment, PoseEstimate, check_cloud
 from iga_drake.geometry.clouds import furthest_point_sampling
+from iga_drake.geometry.se3 import rigid
 from iga_drake.paths import models_dir
 
 
@@ -29,6 +32,25 @@ class IgaConfig:
     nodes: int = 96
     # Modes below this share of the best one's probability are left out.
     minimum_probability: float = 0.01
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """How an estimate came about, for pictures and diagnosis.
+
+    Role 0 is the grasped object, 1 the target; of D + 1 clouds of each the test cloud is the last.
+    """
+
+    estimate: PoseEstimate
+    nodes: Tensor  # (2, D + 1, M, 3) m, in the frames of the clouds as given
+    index: Tensor  # (2, D + 1, M) which point of its cloud every node is
+    logits: Tensor  # (2, D, M, M) of the test nodes' matches with the demonstrations' nodes
+    matches: tuple[list[Match], list[Match]]  # test nodes about their cloud's centroid
+    proposals: tuple[int, int, int]  # pairs of parts that vote, demonstrations, proposals of each
+    energy: Callable[[Tensor], Tensor]  # of any poses X_WF (..., 4, 4); differentiable
+    # Of a pose X_WF (4, 4): (P, Q) shares of the pairs of parts in it, the first nodes of each.
+    pair_weights: Callable[[Tensor], Tensor]
+    seconds: dict[str, float]  # of each stage
 
 
 def default_weights() -> Path:
@@ -67,17 +89,23 @@ class IgaAligner:
         self.config = config or IgaConfig()
         self.voting = voting or VotingConfig()
 
-    def _prepare(self, cloud: np.ndarray, seed: int) -> tuple[Tensor, Tensor]:
-        """Points (P, 3) float64 about the cloud's centroid and that centroid (3,)."""
+    @property
+    def net(self) -> DescriptorNet:
+        """The aligner's own copy of the network, in double precision."""
+        return self._net
+
+    def _prepare(self, cloud: np.ndarray, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Points (P, 3) float64 about the cloud's centroid, that centroid (3,), and which points of
+        the cloud they are (P,)."""
         rng = np.random.default_rng(seed)
         count = self.config.points
         if len(cloud) >= count:
-            cloud = cloud[rng.permutation(len(cloud))[:count]]
+            drawn = rng.permutation(len(cloud))[:count]
         else:
-            cloud = cloud[np.arange(count) % len(cloud)]
-        points = torch.from_numpy(np.ascontiguousarray(cloud))
+            drawn = np.arange(count) % len(cloud)
+        points = torch.from_numpy(np.ascontiguousarray(cloud[drawn]))
         centre = points.mean(0)
-        return points - centre, centre
+        return points - centre, centre, torch.from_numpy(drawn)
 
     def align(
         self,
@@ -88,45 +116,83 @@ class IgaAligner:
         seed: int = 0,
     ) -> PoseEstimate:
         """See `Aligner.align`. Energies are minus the log of the support of a mode."""
+        return self.explain(context, grasped, target, seed=seed).estimate
+
+    @torch.no_grad()
+    def explain(
+        self,
+        context: tuple[Alignment, ...],
+        grasped: np.ndarray,
+        target: np.ndarray,
+        *,
+        seed: int = 0,
+        logits: Callable[[Tensor], Tensor] | None = None,
+    ) -> Explanation:
+        """What `align` does, with everything on the way.
+
+        `logits` takes the place of the learned matches: nodes (2, D + 1, M), as in
+        `Explanation.index`, to logits (2, D, M, M).
+        """
         if not context:
             raise AlignerError("iga: the context is empty: give at least one demonstration")
         clouds = [a.grasped for a in context] + [check_cloud(grasped, "grasped")]
         clouds += [a.target for a in context] + [check_cloud(target, "target")]
-        with torch.no_grad():
-            A, B, centre_A, centre_B, parts = self._matches(clouds, seed)
-            X, energy = vote(A, B, parts, self.voting)
+        began = time.perf_counter()
+        half = len(clouds) // 2
+        points, centre, drawn = (
+            torch.stack(each)
+            for each in zip(*(self._prepare(cloud, seed) for cloud in clouds), strict=True)
+        )
+        chosen = furthest_point_sampling(points, self.config.nodes)
+        nodes = torch.gather(points, 1, chosen[..., None].expand(-1, -1, 3))
+        index = torch.gather(drawn, 1, chosen).unflatten(0, (2, half))
+        found = logits(index) if logits else self._logits(points, chosen)
+        described = time.perf_counter()
+        generator = torch.Generator().manual_seed(seed)
+        # A demonstration's two objects share one frame: their centroids are put back.
+        goal = (nodes + centre[:, None]).unflatten(0, (2, half))
+        test = nodes[half - 1 :: half]  # (2, M, 3)
+        A, B = (
+            [
+                match_object(found[role, d], test[role], goal[role, d], self.voting, generator)
+                for d in range(half - 1)
+            ]
+            for role in range(2)
+        )
+        matched = time.perf_counter()
+        votes = cast_votes(A, B, test[0, : self.voting.parts], self.voting)
+        X, energy = modes(votes)
+        voted = time.perf_counter()
         probability = (-(energy - energy.min())).softmax(0).numpy()
         keep = probability >= self.config.minimum_probability * probability.max()
+        centre_A, centre_B = centre[half - 1 :: half]
         poses = X.numpy()[keep]
         poses[:, :3, 3] += centre_B.numpy() - poses[:, :3, :3] @ centre_A.numpy()
-        return PoseEstimate(
-            poses, energy.numpy()[keep], probability[keep] / probability[keep].sum()
+
+        def about_centroids(X: Tensor) -> Tensor:
+            R = X[..., :3, :3]
+            return rigid(R, X[..., :3, 3] - centre_B + R @ centre_A)
+
+        return Explanation(
+            estimate=PoseEstimate(
+                poses, energy.numpy()[keep], probability[keep] / probability[keep].sum()
+            ),
+            nodes=goal,
+            index=index,
+            logits=found,
+            matches=(A, B),
+            proposals=votes.proposals,
+            energy=lambda X: votes.energy(about_centroids(X)),
+            pair_weights=lambda X: votes.pair_weights(about_centroids(X)),
+            seconds={
+                "describe": described - began,
+                "match": matched - described,
+                "vote": voted - matched,
+            },
         )
 
-    def _matches(
-        self, clouds: list[np.ndarray], seed: int
-    ) -> tuple[list[Match], list[Match], Tensor, Tensor, Tensor]:
-        """Matches of both objects with every demonstration, test clouds about their centroids."""
-        prepared = [self._prepare(cloud, seed) for cloud in clouds]
-        points = torch.stack([p for p, _ in prepared])  # (2 (D + 1), P, 3)
-        index = furthest_point_sampling(points, self.config.nodes)
-        nodes = torch.gather(points, 1, index[..., None].expand(-1, -1, 3))
-        half = len(clouds) // 2
-        descriptors = self._net(points, index, group=half)
-        generator = torch.Generator().manual_seed(seed)
-        matches: list[list[Match]] = []
-        for test in (half - 1, len(clouds) - 1):
-            row = []
-            for d in range(test - half + 1, test):
-                logits = self._net.similarity(descriptors[test], descriptors[d])
-                # The demonstration's two objects share one frame: put its centroid back.
-                goal = nodes[d] + prepared[d][1]
-                row.append(match_object(logits, nodes[test], goal, self.voting, generator))
-            matches.append(row)
-        return (
-            matches[0],
-            matches[1],
-            prepared[half - 1][1],
-            prepared[-1][1],
-            nodes[half - 1, : self.voting.parts],
-        )
+    def _logits(self, points: Tensor, chosen: Tensor) -> Tensor:
+        """(2, D, M, M) of the test nodes' matches, learned; clouds (2 (D + 1), P, 3)."""
+        half = len(points) // 2
+        descriptors = self._net(points, chosen, group=half).unflatten(0, (2, half))
+        return self._net.similarity(descriptors[:, -1:], descriptors[:, :-1])

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from iga_drake.aligners.iga.vector_neurons import VectorLinear
+
 
 @dataclass(frozen=True)
 class DescriptorConfig:
@@ -32,17 +34,6 @@ class DescriptorConfig:
     descriptor: int = 64
     # Whether nodes attend to the object's other clouds after every layer but the last.
     cross: bool = True
-
-
-class VectorLinear(nn.Module):
-    """Mixes vector channels (..., 3, C) -> (..., 3, D); commutes with rotations."""
-
-    def __init__(self, inputs: int, outputs: int):
-        super().__init__()
-        self.weight = nn.Parameter(torch.randn(outputs, inputs) / inputs**0.5)
-
-    def forward(self, v: Tensor) -> Tensor:
-        return nn.functional.linear(v, self.weight)
 
 
 class LocalMoments(nn.Module):

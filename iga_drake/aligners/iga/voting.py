@@ -39,6 +39,8 @@ class VotingConfig:
     distinct: float = 0.5
     # A hypothesis is kept when its mean log-likelihood is this close to the best one's.
     margin: float = 0.12
+    # How many independent nodes a hypothesis' mean log-likelihood speaks for in the vote.
+    hypothesis: float = 10.0
     # Parts of the test objects that vote, and the share of the nodes in a part.
     parts: int = 32
     neighbourhood: float = 0.2
@@ -49,8 +51,10 @@ class VotingConfig:
     reach: float = 0.06
     # Residual of a part's rigid fit at which its weight has fallen to exp(-1/2).
     residual: float = 0.012
-    # Hypothesis combinations per demonstration, candidates in the final vote, modes returned.
+    # Hypothesis combinations of one demonstration, and of all together (the vote compares all with
+    # all); candidates in the final vote; modes returned.
     combinations: int = 16
+    all_combinations: int = 64
     pool: int = 1500
     modes: int = 8
 
@@ -63,6 +67,43 @@ class Match:
     X_DT: Tensor  # (H, parts, 4, 4) rigid fit of every part, test frame -> demonstration frame
     place: Tensor  # (H, parts, 3) where the part lies in the demonstration
     residual: Tensor  # (H, parts) m
+    R_DT: Tensor  # (H, 3, 3) the hypotheses themselves, coarse rotations of the whole object
+    assignment: Tensor  # (H, M, N) probability of every match of test and demonstration nodes
+
+
+@dataclass(frozen=True)
+class Votes:
+    """The candidate poses that agreeing pairs of parts propose; their kernel density is the vote.
+
+    n candidates (at most `VotingConfig.pool`), K pairs of the P parts of A with the Q parts of B.
+    """
+
+    X: Tensor  # (n, 4, 4)
+    log_weight: Tensor  # (n,)
+    pair: Tensor  # (n,) which pair of parts proposed it: i * Q + j
+    shape: tuple[int, int]  # P, Q
+    centre: Tensor  # (3,) in the frame of A: where places are compared
+    proposals: tuple[int, int, int]  # K, D, C: C proposals of each pair in each demonstration
+    config: VotingConfig
+
+    def _log_density(self, X: Tensor) -> Tensor:
+        """(..., n) log of the part of every candidate in the density at poses X (..., 4, 4)."""
+        R = self.X[:, :3, :3].flatten(1)
+        chord2 = (3 - X[..., :3, :3].flatten(-2) @ R.T).clamp_min(0)
+        place, at = (transform(Y, self.centre[None])[..., 0, :] for Y in (X, self.X))
+        off2 = (place[..., None, :] - at).square().sum(-1)
+        distance2 = chord2 / self.config.sigma_rotation**2 + off2 / self.config.sigma_translation**2
+        return self.log_weight - 0.5 * distance2
+
+    def energy(self, X: Tensor) -> Tensor:
+        """Minus the log of the support (...) of poses X (..., 4, 4), any poses; differentiable."""
+        return -self._log_density(X).logsumexp(-1)
+
+    def pair_weights(self, X: Tensor) -> Tensor:
+        """(P, Q) share of every pair of parts in the support of a pose X (4, 4)."""
+        share = self._log_density(X).softmax(-1)
+        P, Q = self.shape
+        return torch.zeros(P * Q).to(share).index_add(0, self.pair, share).reshape(P, Q)
 
 
 def _unit(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -71,10 +112,17 @@ def _unit(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return (points - centre) / scale, centre, scale
 
 
+def _assign(log_p: Tensor, moved: Tensor, y: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
+    """Probabilities (H, M, N) of the matches of test nodes moved (H, M, 3) onto y (N, 3), and
+    log-likelihoods (H, M)."""
+    logits = log_p - torch.cdist(moved, y.expand(len(moved), -1, -1)).square() / (2 * sigma**2)
+    return logits.softmax(-1), logits.logsumexp(-1)
+
+
 def _soft_points(log_p: Tensor, moved: Tensor, y: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
     """Soft matches (H, M, 3) and log-likelihoods (H, M) of test nodes moved (H, M, 3) onto y."""
-    logits = log_p - torch.cdist(moved, y.expand(len(moved), -1, -1)).square() / (2 * sigma**2)
-    return logits.softmax(-1) @ y, logits.logsumexp(-1)
+    assignment, likelihood = _assign(log_p, moved, y, sigma)
+    return assignment @ y, likelihood
 
 
 def _sides(triangle: Tensor) -> Tensor:
@@ -141,8 +189,8 @@ def match_object(
     x, _, _ = _unit(test)
     y, centre, scale = _unit(demonstration)
     X, score = global_hypotheses(logits, x, y, config, generator)
-    soft, _ = _soft_points(logits.log_softmax(-1), transform(X, x), y, config.match_sigma)
-    soft = soft * scale + centre  # (H, M, 3) in the demonstration's frame
+    assignment, _ = _assign(logits.log_softmax(-1), transform(X, x), y, config.match_sigma)
+    soft = (assignment @ y) * scale + centre  # (H, M, 3) in the demonstration's frame
     H, M = soft.shape[:2]
     parts = min(config.parts, M)
     count = max(6, round(config.neighbourhood * M))
@@ -153,7 +201,8 @@ def match_object(
     fit = kabsch(source, goal, weight.expand(H, -1, -1))
     error = (transform(fit, source) - goal).square().sum(-1)
     residual = ((weight * error).sum(-1) / weight.sum(-1)).sqrt()
-    return Match(score, fit, transform(fit, test[:parts, None])[..., 0, :], residual)
+    place = transform(fit, test[:parts, None])[..., 0, :]
+    return Match(score, fit, place, residual, X[:, :3, :3], assignment)
 
 
 def _pose_distance2(Ra: Tensor, pa: Tensor, Rb: Tensor, pb: Tensor, config: VotingConfig) -> Tensor:
@@ -167,22 +216,23 @@ def _pose_distance2(Ra: Tensor, pa: Tensor, Rb: Tensor, pb: Tensor, config: Voti
 
 def _combine(A: list[Match], B: list[Match], config: VotingConfig) -> tuple[Tensor, Tensor, Tensor]:
     """Proposals X (D, C, P, Q, 4, 4), log weights (D, C, P, Q) and distances of the parts."""
+    most = max(2, min(config.combinations, config.all_combinations // len(A)))
     poses, weights, gaps = [], [], []
     for a, b in zip(A, B, strict=True):
         log_prior = (
             a.log_likelihood.sub(a.log_likelihood.max())[:, None]
             + b.log_likelihood.sub(b.log_likelihood.max())[None]
         ).flatten()
-        count = min(config.combinations, len(log_prior))
+        count = min(most, len(log_prior))
         best = log_prior.topk(count).indices
         i, j = best // len(b.log_likelihood), best % len(b.log_likelihood)
         X = inverse(b.X_DT[j])[:, None] @ a.X_DT[i][:, :, None]  # (C, P, Q, 4, 4)
         gap = torch.cdist(a.place[i], b.place[j])
-        quality = -0.5 * (
+        quality = config.hypothesis * log_prior[best][:, None, None] - 0.5 * (
             (a.residual[i] / config.residual).square()[:, :, None]
             + (b.residual[j] / config.residual).square()[:, None]
         )
-        padding = config.combinations - count
+        padding = most - count
         if padding:
             X = torch.cat((X, X[:1].expand(padding, -1, -1, -1, -1)))
             gap = torch.cat((gap, gap[:1].expand(padding, -1, -1)))
@@ -202,6 +252,11 @@ def vote(
 
     A, B: the matches of both objects, one per demonstration; test_A (P, 3) the voting parts of A.
     """
+    return modes(cast_votes(A, B, test_A, config))
+
+
+def cast_votes(A: list[Match], B: list[Match], test_A: Tensor, config: VotingConfig) -> Votes:
+    """The votes from which `vote` takes the modes; its arguments."""
     X, log_w, gap = _combine(A, B, config)
     D, C, P, Q = log_w.shape
     real = int((log_w[..., 0, 0] > -500).sum(1).max())
@@ -217,15 +272,19 @@ def vote(
     part = test_A[:P][keep // Q]  # (K, 3)
     R = X[..., :3, :3]
     place = transform(X, part[:, None, None].expand(-1, X.shape[1], 1, 3))[..., 0, :]
-    chord2 = (3 - R.flatten(2) @ R.flatten(2).transpose(1, 2)).clamp_min(0)
-    distance2 = (
-        chord2 / config.sigma_rotation**2
-        + (torch.cdist(place, place) / config.sigma_translation).square()
-    )
     K = len(X)
-    kernel = (-0.5 * distance2).exp().reshape(K, D * C, D, C)
-    kernel = kernel * log_w.exp()[:, None]
-    best, which = kernel.max(-1)  # (K, DC, D)
+    flat, weights = R.flatten(2), log_w.exp()
+    supports = []
+    for d in range(D):  # one at a time: memory grows with D, not with its square
+        own = slice(d * C, (d + 1) * C)
+        chord2 = (3 - flat @ flat[:, own].transpose(1, 2)).clamp_min(0)
+        distance2 = (
+            chord2 / config.sigma_rotation**2
+            + (torch.cdist(place, place[:, own]) / config.sigma_translation).square()
+        )
+        supports.append(((-0.5 * distance2).exp() * weights[:, None, d]).max(-1))
+    best = torch.stack([support.values for support in supports], -1)  # (K, DC, D)
+    which = torch.stack([support.indices for support in supports], -1)
     support = (best + 1e-3).log().sum(-1)  # (K, DC)
     total = support + prior[:, None] + log_w.reshape(K, D * C)
     top = total.flatten().topk(min(config.pool, K * D * C)).indices
@@ -244,24 +303,23 @@ def vote(
         share[..., None] * transform(members, at[:, None, None].expand(-1, D, 1, 3))[:, :, 0]
     ).sum(1)
     candidates = rigid(rotation, moved - (rotation @ at[..., None])[..., 0])
-    return _modes(candidates, weight, at.mean(0), config)
+    return Votes(candidates, weight, keep[k], (P, Q), at.mean(0), (K, D, C), config)
 
 
-def _modes(
-    X: Tensor, log_weight: Tensor, centre: Tensor, config: VotingConfig
-) -> tuple[Tensor, Tensor]:
+def modes(votes: Votes) -> tuple[Tensor, Tensor]:
     """Clusters weighted poses: kernel density, mean shift from the densest, non-maximum
-    suppression."""
+    suppression. See `vote`."""
+    X, log_weight, centre, config = votes.X, votes.log_weight, votes.centre, votes.config
     R = X[:, :3, :3]
     place = transform(X, centre[None].expand(len(X), 1, 3))[:, 0]
     weight = (log_weight - log_weight.max()).exp()
     alive = torch.ones(len(X), dtype=torch.bool)
-    poses: list[Tensor] = []
+    found: list[tuple[Tensor, Tensor]] = []
     energies: list[float] = []
     chord2 = (3 - R.flatten(1) @ R.flatten(1).T).clamp_min(0) / config.sigma_rotation**2
     distance2 = chord2 + (torch.cdist(place, place) / config.sigma_translation).square()
     density = (-0.5 * distance2).exp() @ weight
-    while len(poses) < config.modes and alive.any():
+    while len(found) < config.modes and alive.any():
         seed = int(torch.where(alive, density, torch.zeros_like(density)).argmax())
         rotation, p = R[seed], place[seed]
         for _ in range(3):
@@ -270,11 +328,15 @@ def _modes(
             rotation = nearest_rotation((near[:, None, None] * R).sum(0))
             p = (near[:, None] * place).sum(0)
         d2 = _pose_distance2(R, place, rotation, p, config)
-        mass = float(((-0.5 * d2).exp() * weight).sum())
-        poses.append(rigid(rotation, p - rotation @ centre))
-        energies.append(-float(torch.log(torch.tensor(mass + 1e-30))) - float(log_weight.max()))
         alive &= (d2 > 9.0) & (distance2[seed] > 4.0)
-        if len(poses) > 1 and energies[-1] > energies[0] + 6:
+        if any(_pose_distance2(S, q, rotation, p, config) < 9.0 for S, q in found):
+            continue  # the shift led to a mode that is there already
+        found.append((rotation, p))
+        mass = float(((-0.5 * d2).exp() * weight).sum())
+        energies.append(-math.log(mass + 1e-30) - float(log_weight.max()))
+        if energies[-1] > energies[0] + 6:
             break
-    order = torch.tensor(energies).argsort()
-    return torch.stack(poses)[order], torch.tensor(energies)[order]
+    poses = torch.stack([rigid(rotation, p - rotation @ centre) for rotation, p in found])
+    energy = torch.tensor(energies, dtype=poses.dtype)
+    order = energy.argsort()
+    return poses[order], energy[order]

@@ -32,7 +32,8 @@ def default_weights() -> Path:
 
 @lru_cache(maxsize=4)
 def _landed(path: Path) -> DifNet:
-    return load_dif_net(path)[0]
+    with torch.random.fork_rng(devices=[]):  # making a network draws random numbers
+        return load_dif_net(path)[0]
 
 
 class DifNetDeformer:

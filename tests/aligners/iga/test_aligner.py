@@ -7,8 +7,9 @@ import pytest
 from iga_drake.aligners.icp import IcpAligner
 from iga_drake.aligners.iga.aligner import IgaAligner
 from iga_drake.aligners.protocol import Alignment
+from iga_drake.dataset.alignment_error import pose_errors, random_pose
 from iga_drake.dataset.samples import make_sample
-from iga_drake.evaluation.alignment import evaluate_alignment, pose_errors, random_pose
+from iga_drake.evaluation.alignment import evaluate_alignment
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +63,9 @@ def test_estimates_are_proper_poses_with_probabilities(aligner: IgaAligner) -> N
 
 def test_the_landed_weights_beat_icp_by_far(aligner: IgaAligner) -> None:
     ours, icp = (
-        evaluate_alignment(each, "unseen_categories", 12)[0].modulo
+        evaluate_alignment(each, "unseen_categories", 16)[0].modulo
         for each in (aligner, IcpAligner())
     )
-    assert ours.rotation_median < 0.5 * icp.rotation_median
-    assert ours.translation_median < icp.translation_median
+    assert ours.rotation_mean < 0.6 * icp.rotation_mean
+    assert ours.rotation_median < icp.rotation_median
+    assert ours.translation_median < 0.7 * icp.translation_median

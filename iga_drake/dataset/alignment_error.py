@@ -1,0 +1,76 @@
+"""Error of the pose that an aligner finds for a sample's test pair.
+
+The test pair's grasped cloud starts at a Haar-random pose. Translation error: distance that the
+centroid of the grasped cloud ends from where it belongs; rotation error: geodesic angle. Where the
+demonstrations show several alignments, the nearest one counts.
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from iga_drake.dataset.samples import Sample, SampleConfig
+from iga_drake.shapes.symmetry import Symmetry
+
+# Observed clouds of the evaluation sets are denser than those of training.
+CONFIG = SampleConfig(cloud_points=512)
+
+
+def random_pose(index: int) -> np.ndarray:
+    """A Haar-random start pose (4, 4), the same for every aligner."""
+    rng = np.random.default_rng([7, index])
+    X = np.eye(4)
+    X[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    X[:3, 3] = rng.normal(size=3) * 0.3
+    return X
+
+
+def pose_errors(estimate: np.ndarray, truth: np.ndarray, cloud: np.ndarray) -> tuple[float, float]:
+    """Centroid distance (m) and angle (rad) between two poses (4, 4) of a cloud (P, 3)."""
+    centre = np.append(cloud.mean(0), 1.0)
+    relative = estimate[:3, :3].T @ truth[:3, :3]
+    cosine = np.clip((np.trace(relative) - 1) / 2, -1, 1)
+    return float(np.linalg.norm((estimate - truth) @ centre)), float(np.arccos(cosine))
+
+
+def equivalents(sample: Sample, *, symmetry: bool) -> np.ndarray:
+    """(n, 4, 4) motions in W of the test pair's A that end in a valid alignment; with `symmetry`
+    also those that differ by the families' symmetries."""
+    motions = sample.modes
+    if not symmetry:
+        return motions
+    of_A, of_B = (
+        _turns(group, axis) for group, axis in zip(sample.symmetries, sample.axes, strict=True)
+    )
+    # B's symmetry turns what stands around it; A's turns A in its place.
+    motions = motions[:, None] @ of_A[None]
+    return (of_B[:, None, None] @ motions[None]).reshape(-1, 4, 4)
+
+
+def _turns(group: Symmetry, axis: np.ndarray) -> np.ndarray:
+    """(n, 4, 4) the group's rotations about an axis (2, 3), point and direction."""
+    point, direction = axis
+    X = np.tile(np.eye(4), (len(group.angles()), 1, 1))
+    X[:, :3, :3] = Rotation.from_rotvec(group.angles()[:, None] * direction).as_matrix()
+    X[:, :3, 3] = point - X[:, :3, :3] @ point
+    return X
+
+
+def nearest_valid(motion: np.ndarray, valid: np.ndarray, cloud: np.ndarray) -> np.ndarray:
+    """The one (4, 4) of the motions `valid` (n, 4, 4) that puts the points of a cloud (P, 3)
+    nearest to where `motion` (4, 4) puts them."""
+    few = cloud[:: max(1, len(cloud) // 32)].astype(np.float64)
+    ends = few @ np.swapaxes(valid[:, :3, :3], 1, 2) + valid[:, None, :3, 3]
+    off = ends - (few @ motion[:3, :3].T + motion[:3, 3])
+    return valid[int(np.square(off).sum((1, 2)).argmin())]
+
+
+def nearest_error(motion: np.ndarray, valid: np.ndarray, cloud: np.ndarray) -> tuple[float, float]:
+    """Errors (m, rad) of a motion (4, 4) of a cloud (P, 3) against the nearest of `valid`."""
+    return pose_errors(motion, nearest_valid(motion, valid, cloud), cloud)
+
+
+def displacement(motion: np.ndarray, valid: np.ndarray, cloud: np.ndarray) -> float:
+    """Mean distance (m) of a cloud's points from where the nearest of `valid` puts them: one figure
+    for translation and rotation."""
+    difference = (motion - nearest_valid(motion, valid, cloud))[:3]
+    return float(np.linalg.norm(cloud @ difference[:, :3].T + difference[:, 3], axis=1).mean())

@@ -1,0 +1,438 @@
+"""`iga evaluate diagnosis`: where the error of a checkpoint comes from.
+
+The same samples and start poses as `iga evaluate alignment`. Beside the error of the found pose
+stand the errors with one cause taken away at a time: true matches in place of the learned ones, the
+best of the returned modes, a descent of the energy from the truth, the oracle.
+"""
+
+import argparse
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from iga_drake.aligners.iga.aligner import Explanation, IgaAligner
+from iga_drake.aligners.protocol import PoseEstimate
+from iga_drake.aligners.query import Query
+from iga_drake.dataset.alignment_error import CONFIG, equivalents, nearest_error, random_pose
+from iga_drake.dataset.oracle import oracle_pose
+from iga_drake.dataset.samples import Sample, make_sample
+from iga_drake.dataset.splits import sample_set
+from iga_drake.errors import IgaDrakeError
+from iga_drake.evaluation.alignment import FIVE_SETS, Errors
+from iga_drake.geometry.se3 import geodesic_angle, kabsch, rigid, so3_exp, transform
+from iga_drake.training.descriptor import DescriptorTraining
+
+WRONG = np.radians(45)  # a coarse hypothesis further off than this is wrong
+TERCILES = ("least", "middle", "most")
+LOWER = 1e-3  # an energy counts as lower than another where it is by this much
+# What a pose is called in the table, and how it was found.
+POSES = {
+    "plain": "found, plain",
+    "found": "found",
+    "true_matches": "true matches",
+    "best_mode": "best of the modes",
+    "from_truth": "descent from truth",
+    "oracle": "oracle",
+}
+MATCHES = {
+    "argmax": "most likely node",
+    "soft": "soft",
+    "hypothesis": "soft, best hypothesis",
+    "nearest": "nearest node (floor)",
+}
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A sample, and what an aligner is asked about it."""
+
+    sample: Sample
+    query: Query
+
+    @staticmethod
+    def of(split: str, index: int, demonstrations: int | None = None) -> "Problem":
+        """Sample `index` of a set with its first demonstrations (default: all)."""
+        sample = make_sample(split, index, CONFIG)
+        shown = [*range(sample.points.shape[1] - 1)[:demonstrations], -1]
+        return Problem(sample, Query.of(sample.points[:, shown], random_pose(index)))
+
+    def with_first(self, demonstrations: int) -> "Problem":
+        """The same with fewer demonstrations."""
+        query = replace(self.query, context=self.query.context[:demonstrations])
+        return Problem(self.sample, query)
+
+    def valid(self) -> np.ndarray:
+        """(n, 4, 4) right answers X_WF, those that differ by the families' symmetries too."""
+        return equivalents(self.sample, symmetry=True) @ np.linalg.inv(self.query.start)
+
+    def error(self, X_WF: np.ndarray, *, symmetry: bool = True) -> tuple[float, float]:
+        """Errors (m, rad) of an answer (4, 4)."""
+        valid = equivalents(self.sample, symmetry=symmetry)
+        return nearest_error(X_WF @ self.query.start, valid, self.sample.points[0, -1])
+
+
+@dataclass(frozen=True)
+class ObjectMatches:
+    """One object of a sample against one demonstration."""
+
+    category: str
+    # rad, of every coarse hypothesis, best first: distance from the true rotation
+    off: tuple[float, ...]
+    off_modulo: tuple[float, ...]  # modulo the family's symmetry
+    # m and share of the size: mean over nodes, and their median share; by the names of MATCHES
+    error: dict[str, tuple[float, float, float]]
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """One sample. Errors are (m, rad), modulo symmetry but for `plain`."""
+
+    split: str
+    index: int
+    errors: dict[str, tuple[float, float]]  # by the names of POSES; no oracle where it has none
+    # Energies of the found pose, of the nearest-by truth (the lowest of the equivalent ones), and
+    # of the ends of descents from both.
+    energy_found: float
+    energy_truth: float
+    energy_from_found: float
+    energy_from_truth: float
+    deformation: float
+    objects: tuple[ObjectMatches, ...]
+
+
+def true_logits(sample: Sample, index: Tensor, sigma: float) -> Tensor:
+    """(2, D, M, M) logits of the true matches: a Gaussian in the canonical distance.
+
+    `index` (2, D + 1, M) says which points of the clouds are nodes; `sigma` in units of the size.
+    """
+    place = _places(sample, index)
+    return -torch.cdist(place[:, -1:], place[:, :-1]).square() / (2 * sigma**2)
+
+
+def _places(sample: Sample, index: Tensor) -> Tensor:
+    """(2, D + 1, M, 3) canonical places of nodes, the first D demonstrations and the test pair."""
+    canonical = torch.from_numpy(sample.canonical).double()
+    shown = torch.cat((canonical[:, : index.shape[1] - 1], canonical[:, -1:]), 1)
+    return torch.gather(shown, 2, index[..., None].expand(-1, -1, -1, 3))
+
+
+def deformation(sample: Sample) -> float:
+    """How far the instances are from scaled copies of the canonical one: root-mean-square residual
+    of the best similarity fit, as a share of the size, mean over both objects of all pairs.
+
+    Includes the cameras' noise.
+    """
+    points = torch.from_numpy(sample.points).double()
+    canonical = torch.from_numpy(sample.canonical).double()
+    # Scale by the spread of the points: the optimal one times the fit's correlation, near 1.
+    middle = canonical.mean(2, keepdim=True)
+    spread = [c.var(2).sum(-1).sqrt() for c in (points, canonical)]
+    canonical = (canonical - middle) * (spread[0] / spread[1])[..., None, None]
+    fit = transform(kabsch(canonical, points), canonical)
+    residual = (fit - points).square().sum(-1).mean(-1).sqrt()
+    return float((residual / torch.from_numpy(sample.size)).mean())
+
+
+def hypothesis_errors(
+    problem: Problem, explanation: Explanation, role: int, d: int
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Angles (rad) of the coarse hypotheses of an object from the true rotation between the test
+    and demonstration d; plain and modulo the family's symmetry."""
+    sample = problem.sample
+    size = sample.size[role, :, None, None]
+    fit = kabsch(
+        torch.from_numpy(sample.canonical[role] * size).double(),
+        torch.from_numpy(sample.points[role]).double(),
+    )[:, :3, :3]
+    truth = fit[d] @ fit[-1].T
+    found = explanation.matches[role][d].R_DT
+    if role == 0:
+        found = found @ torch.from_numpy(problem.query.start[:3, :3])
+    turns = sample.symmetries[role].angles()[:, None] * sample.axes[role, 1]
+    same = truth @ torch.from_numpy(Rotation.from_rotvec(turns).as_matrix())
+    off = geodesic_angle(found[:, None], same)
+    return tuple(off[:, 0].tolist()), tuple(off.amin(1).tolist())
+
+
+def match_errors(
+    sample: Sample, explanation: Explanation, role: int, d: int, within: float
+) -> dict[str, tuple[float, float, float]]:
+    """Of the matches of test nodes whose true match is seen `within` that share of the size:
+    see `ObjectMatches.error`. Not modulo symmetry."""
+    places = _places(sample, explanation.index)[role]
+    test, demonstration = places[-1], places[d]
+    distance = torch.cdist(test, demonstration)
+    seen = distance.amin(-1) < within
+    logits, assignment = explanation.logits[role, d], explanation.matches[role][d].assignment[0]
+    errors = {
+        "argmax": distance.gather(1, logits.argmax(-1, keepdim=True))[:, 0],
+        "soft": (logits.softmax(-1) @ demonstration - test).norm(dim=-1),
+        "hypothesis": (assignment @ demonstration - test).norm(dim=-1),
+        "nearest": distance.amin(-1),
+    }
+    if not seen.any():
+        return {}
+    size = float(sample.size[role, d])
+    result = {}
+    for name, error in errors.items():
+        mean, median = float(error[seen].mean()), float(error[seen].median())
+        result[name] = (size * mean, mean, median)
+    return result
+
+
+def step_from(X: Tensor, centre: Tensor, step: Tensor) -> Tensor:
+    """(..., 4, 4): the pose X (4, 4) after a turn and a shift, step (..., 6): rad, then m.
+
+    Turns about the place of `centre` (3,), a point of the moved frame.
+    """
+    middle = transform(X, centre[None])[0]
+    turn = so3_exp(step[..., :3])
+    moved = (turn @ (X[:3, 3] - middle)[:, None])[..., 0] + middle + step[..., 3:]
+    return rigid(turn @ X[:3, :3], moved)
+
+
+def descend(energy: Callable[[Tensor], Tensor], X: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """The pose (4, 4) at the end of a descent of an energy from pose X (4, 4), by L-BFGS.
+
+    Turns about `centre` (3,), a point of the moved frame; 1 cm counts as much as 0.1 rad.
+    """
+    start, middle = torch.from_numpy(X), torch.from_numpy(centre)
+    units = torch.tensor([0.1] * 3 + [0.01] * 3, dtype=torch.float64)
+    step = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.LBFGS([step], max_iter=50, line_search_fn="strong_wolfe")
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        value = energy(step_from(start, middle, units * step))
+        value.backward()
+        return value
+
+    with torch.enable_grad():
+        optimizer.step(closure)  # type: ignore[no-untyped-call]
+    return step_from(start, middle, units * step.detach()).numpy()
+
+
+def diagnose_sample(aligner: IgaAligner, split: str, index: int) -> Diagnosis:
+    """One sample of a set."""
+    training = DescriptorTraining()
+    problem = Problem.of(split, index)
+    sample = problem.sample
+    clouds = problem.query.clouds
+    explanation = aligner.explain(*clouds, seed=index)
+    informed = aligner.explain(
+        *clouds, seed=index, logits=lambda at: true_logits(sample, at, training.target_sigma)
+    )
+
+    def energy(X: np.ndarray) -> np.ndarray:
+        return explanation.energy(torch.from_numpy(X)).numpy()
+
+    found = explanation.estimate.poses[0]
+    valid = problem.valid()
+    energies = energy(valid)
+    truth = valid[energies.argmin()]
+    centre = problem.query.grasped.mean(0)
+    from_truth, from_found = (descend(explanation.energy, X, centre) for X in (truth, found))
+    errors = {
+        "plain": problem.error(found, symmetry=False),
+        "found": problem.error(found),
+        "true_matches": problem.error(informed.estimate.poses[0]),
+        "best_mode": _best(problem, explanation.estimate),
+        "from_truth": problem.error(from_truth),
+    }
+    oracle = oracle_pose(sample)
+    if oracle is not None:
+        errors["oracle"] = problem.error(oracle @ np.linalg.inv(problem.query.start))
+    return Diagnosis(
+        split=split,
+        index=index,
+        errors=errors,
+        energy_found=float(explanation.estimate.energies[0]),
+        energy_truth=float(energies.min()),
+        energy_from_found=float(energy(from_found)),
+        energy_from_truth=float(energy(from_truth)),
+        deformation=deformation(sample),
+        objects=tuple(
+            ObjectMatches(
+                sample.category[role],
+                *hypothesis_errors(problem, explanation, role, d),
+                match_errors(sample, explanation, role, d, training.visible_within),
+            )
+            for role in range(2)
+            for d in range(len(problem.query.context))
+        ),
+    )
+
+
+def _best(problem: Problem, estimate: PoseEstimate) -> tuple[float, float]:
+    """The least error of the modes; 1 cm counts as much as 5 degrees."""
+    errors = [problem.error(X) for X in estimate.poses]
+    return min(errors, key=lambda error: error[0] / 0.01 + error[1] / np.radians(5))
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """Shares of wrong coarse hypotheses; the second of each pair is modulo symmetry."""
+
+    count: int  # objects matched with a demonstration
+    first: tuple[float, float]  # the best one is wrong
+    kept: tuple[float, float]  # of all
+    none: tuple[float, float]  # no hypothesis is right
+
+    @staticmethod
+    def of(objects: Sequence[ObjectMatches]) -> "Hypotheses":
+        """Over some objects."""
+        off = [[np.array(a) > WRONG for a in (o.off, o.off_modulo)] for o in objects]
+
+        def share(wrong: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float]:
+            plain, modulo = (
+                float(np.concatenate([wrong(each[k]).ravel() for each in off]).mean())
+                for k in range(2)
+            )
+            return plain, modulo
+
+        return Hypotheses(
+            len(objects),
+            share(lambda wrong: wrong[:1]),
+            share(lambda wrong: wrong),
+            share(lambda wrong: np.array([wrong.all()])),
+        )
+
+    def columns(self) -> str:
+        """Part of a row of the table: percentages, plain and modulo symmetry."""
+        pairs = (self.first, self.kept, self.none)
+        return "   ".join(f"{100 * a:5.1f} {100 * b:5.1f}" for a, b in pairs)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A set."""
+
+    split: str
+    count: int
+    errors: dict[str, tuple[int, Errors]]  # by the names of POSES; over how many samples
+    below_truth: float  # share of samples whose found energy is below the truth's
+    gap_median: float  # of the truth's energy minus the found one's
+    missed: float  # share on which a descent from the truth ends lower than one from the found pose
+    matches: dict[str, tuple[float, float, float]]  # by the names of MATCHES: cm, %, median %
+    hypotheses: Hypotheses
+    categories: dict[str, Hypotheses]
+    # of each of TERCILES: bounds of the deformation, errors of the found pose
+    deformation: tuple[tuple[float, float, Errors], ...]
+
+    def table(self, *, categories: bool = False) -> str:
+        """Text of many lines."""
+        lines = [
+            f"{self.split}, {self.count} samples; errors modulo symmetry unless said otherwise",
+            f"{'':<22} {'count':>5}  {'cm mean ± std (median)':<21}  "
+            f"{'deg mean ± std (median)':<22}  % in 1 cm 5°, 2 cm 10°, 3 cm 15°",
+        ]
+        for name, (count, errors) in self.errors.items():
+            lines.append(f"{POSES[name]:<22} {count:>5}  {errors.columns()}")
+        lines.append("found, by the instances' deformation in % of their size")
+        for name, (low, high, errors) in zip(TERCILES, self.deformation, strict=False):
+            label = f"{name}, {100 * low:.1f}-{100 * high:.1f}"
+            lines.append(f"{label:<22} {'':>5}  {errors.columns()}")
+        lines += [
+            f"energy of the found pose below the truth's: {100 * self.below_truth:.0f} % of the "
+            f"samples, median difference {self.gap_median:.2f}",
+            f"search missed a lower energy near the truth: {100 * self.missed:.0f} %",
+            f"{'match error':<22}     cm   % of size mean   median",
+        ]
+        for name, (cm, mean, median) in self.matches.items():
+            lines.append(f"{MATCHES[name]:<22} {cm:6.2f}   {mean:14.1f}   {median:6.1f}")
+        lines.append(
+            f"{'wrong by over 45°, %':<22} {'count':>5}   best one      all kept      none right"
+            "     (plain, modulo symmetry)"
+        )
+        lines.append(
+            f"{'coarse hypotheses':<22} {self.hypotheses.count:>5}  {self.hypotheses.columns()}"
+        )
+        if categories:
+            worst = sorted(self.categories.items(), key=lambda item: -item[1].none[1])
+            lines += [f"  {name:<20} {h.count:>5}  {h.columns()}" for name, h in worst]
+        return "\n".join(lines)
+
+
+def summarise(rows: Iterable[Diagnosis]) -> Summary:
+    """Over the samples of one set."""
+    rows = list(rows)
+    objects = [o for row in rows for o in row.objects]
+    errors = {}
+    for name in POSES:
+        values = [row.errors[name] for row in rows if name in row.errors]
+        if values:
+            errors[name] = (len(values), _errors(values))
+    matches = {}
+    for name in MATCHES:
+        table = np.array([o.error[name] for o in objects if o.error])
+        if len(table):
+            cm, mean, median = 100 * table.mean(0)
+            matches[name] = (float(cm), float(mean), float(median))
+    order = sorted(rows, key=lambda row: row.deformation)
+    terciles = []
+    for part in np.array_split(np.arange(len(order)), len(TERCILES)):
+        some = [order[k] for k in part]
+        if some:
+            bounds = some[0].deformation, some[-1].deformation
+            terciles.append((*bounds, _errors([row.errors["found"] for row in some])))
+    return Summary(
+        split=rows[0].split,
+        count=len(rows),
+        errors=errors,
+        below_truth=float(np.mean([row.energy_found < row.energy_truth for row in rows])),
+        gap_median=float(np.median([row.energy_truth - row.energy_found for row in rows])),
+        missed=float(
+            np.mean([row.energy_from_truth < row.energy_from_found - LOWER for row in rows])
+        ),
+        matches=matches,
+        hypotheses=Hypotheses.of(objects),
+        categories={
+            name: Hypotheses.of([o for o in objects if o.category == name])
+            for name in sorted({o.category for o in objects})
+        },
+        deformation=tuple(terciles),
+    )
+
+
+def _errors(values: Sequence[tuple[float, float]]) -> Errors:
+    translation, rotation = np.array(values).T
+    return Errors.of(translation, rotation)
+
+
+def add_evaluate_diagnosis(parser: argparse.ArgumentParser) -> None:
+    """Options of `iga evaluate diagnosis`."""
+    parser.description = "Where the error of a checkpoint comes from."
+    parser.add_argument(
+        "--sets", type=lambda text: text.split(","), default=list(FIVE_SETS),
+        help="of samples, separated by commas (default: the paper's five)",
+    )  # fmt: skip
+    parser.add_argument("--count", type=int, default=50, help="samples of each set (default 50)")
+    parser.add_argument("--weights", type=Path, help="of iga (default: the landed ones)")
+    parser.add_argument("--by-category", action="store_true", help="hypotheses by kind of object")
+    parser.add_argument("--json", action="store_true", help="print summaries and samples as JSON")
+
+
+def evaluate_diagnosis(arguments: argparse.Namespace) -> int:
+    """Runs `iga evaluate diagnosis`; returns the exit status."""
+    if arguments.count < 1:
+        raise IgaDrakeError(f"--count {arguments.count}: at least 1 sample is needed")
+    for split in arguments.sets:
+        sample_set(split)  # raises before anything is computed
+    aligner = IgaAligner(weights=arguments.weights)
+    document = []
+    for split in arguments.sets:
+        rows = [diagnose_sample(aligner, split, index) for index in range(arguments.count)]
+        summary = summarise(rows)
+        if arguments.json:
+            document.append({**asdict(summary), "samples": [asdict(row) for row in rows]})
+        else:
+            print(summary.table(categories=arguments.by_category) + "\n", flush=True)
+    if arguments.json:
+        print(json.dumps(document, indent=2))
+    return 0

@@ -1,0 +1,113 @@
+"""Occupancy training: learns, goes on after a stop exactly where it was, and is scored rightly."""
+
+import argparse
+from pathlib import Path
+
+import pytest
+import torch
+
+from iga_drake.aligners.iga.local_encoder import ENCODER, DecoderConfig, EncoderConfig, load_encoder
+from iga_drake.checkpoint import load_checkpoint
+from iga_drake.dataset.occupancy import OccupancyConfig, make_occupancy_sample
+from iga_drake.paths import models_dir
+from iga_drake.training.encoder import (
+    EncoderTraining,
+    add_arguments,
+    always_occupied,
+    centre_baseline,
+    network_predictor,
+    occupancy_scores,
+    point_baseline,
+    train_encoder,
+)
+
+MODEL = EncoderConfig(channels=24, scalars=16, layers=3, point_layers=2)
+DECODER = DecoderConfig(query="projections", width=32, blocks=1, frequencies=6)
+SAMPLES = OccupancyConfig(cloud_points=96, camera_points=500, least_seen=16, queries=400)
+
+
+def _config(steps: int, **changes) -> EncoderTraining:
+    changes = {"batch": 2, "uses": 3, "warmup": 2, "bf16": False, "centres": (4, 8)} | changes
+    return EncoderTraining(steps=steps, **changes)
+
+
+def _train(folder: Path, config: EncoderTraining, **options) -> dict:
+    options.setdefault("validation_count", 2)
+    return train_encoder(
+        folder, encoder=MODEL, decoder=DECODER, config=config, samples=SAMPLES, **options
+    )
+
+
+def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
+    card = _train(tmp_path / "whole", _config(8))
+    assert card["samples_seen"] == 6
+    # As a kill would leave it: stopped within the uses of a batch, at step 4 of 8.
+    _train(tmp_path / "half", _config(8), stop_at=4)
+    resumed = train_encoder(tmp_path / "half", config=_config(8), validation_count=2)
+    assert resumed["validation"] == card["validation"] and resumed["encoder"] == card["encoder"]
+    states = [
+        load_checkpoint(tmp_path / name / "state.safetensors", kind=ENCODER + "-state")[0]
+        for name in ("whole", "half")
+    ]
+    assert states[0].keys() == states[1].keys()
+    for name in states[0]:
+        torch.testing.assert_close(states[1][name], states[0][name], atol=0, rtol=0)
+
+
+def test_training_tells_more_than_the_distance_from_the_centres(tmp_path: Path) -> None:
+    config = _config(100, batch=6, uses=10, learning_rate=4e-3, ema=0.95, warmup=10, centres=(8, 8))
+    _train(tmp_path, config)
+    net, card = load_encoder(tmp_path / "encoder.safetensors")
+    assert card["step"] == 100
+    radii = (0.015, 0.02, 0.025, 0.03, 0.04, 0.05)
+    scores = occupancy_scores(
+        {"encoder": network_predictor(net), "always": always_occupied}
+        | {f"{r}": centre_baseline(r) for r in radii},
+        split="validation",
+        count=24,
+        samples=SAMPLES,
+    )
+    learned = scores["encoder"]["accuracy"]
+    assert learned > max(scores[f"{r}"]["accuracy"] for r in radii) + 0.01
+    assert learned > scores["always"]["accuracy"] + 0.1
+
+
+def test_the_landed_encoder_knows_more_than_the_distance_from_the_centres() -> None:
+    net, card = load_encoder(models_dir() / "weights" / "encoder.safetensors")
+    assert card["step"] == card["training"]["steps"]
+    radii = (0.02, 0.025, 0.03, 0.035, 0.04)
+    scores = occupancy_scores(
+        {"encoder": network_predictor(net)} | {f"{r}": centre_baseline(r) for r in radii},
+        split="unseen_categories",
+        count=16,
+    )
+    for measure, margin in (("accuracy", 0.05), ("iou", 0.05), ("iou_uniform", 0.05)):
+        best = max(scores[f"{r}"][measure] for r in radii)
+        assert scores["encoder"][measure] > best + margin, measure
+
+
+def test_scores_are_those_counted_by_hand() -> None:
+    sample = make_occupancy_sample("validation", 0, SAMPLES)
+    true = sample.distance < SAMPLES.shell
+    near = torch.cdist(torch.from_numpy(sample.queries), torch.from_numpy(sample.points)).amin(1)
+    said = (near < 0.006).numpy()
+    scores = occupancy_scores(
+        {"near": point_baseline(0.006), "all": always_occupied},
+        split="validation",
+        count=1,
+        samples=SAMPLES,
+    )
+    box = sample.uniform
+    assert scores["near"]["accuracy"] == pytest.approx((said == true).mean())
+    assert scores["near"]["iou"] == pytest.approx((said & true).sum() / (said | true).sum())
+    assert scores["near"]["iou_uniform"] == pytest.approx(
+        (said & true & box).sum() / ((said | true) & box).sum()
+    )
+    assert scores["all"]["iou"] == pytest.approx(true.mean())
+
+
+def test_the_command_s_options_have_the_paper_s_defaults() -> None:
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    arguments = parser.parse_args(["--out", "x"])
+    assert (arguments.size, arguments.query) == ("paper", "position")
