@@ -1,4 +1,4 @@
-"""Samples of a user's own meshes: deformed instances of each, split by name, broken ones skipped."""
+"""Samples of a user's own meshes: deformed instances, split by name, broken ones skipped."""
 
 from pathlib import Path
 
