@@ -200,7 +200,7 @@ def instance_meshes(
     same = DeformableShape(vertices[0], faces)
     for n in range(1, len(vertices)):
         shape = same if deformation == "parts" else DeformableShape(vertices[n], faces)
-        deformer = _deformer(deformation, levels[n], cells)
+        deformer = _deformer(deformation, levels[n], cells, chosen.double)
         if deformer is not None:
             vertices[n] = deformer.deform(shape, int(each[n].integers(1 << 31)))
     # One factor for all: instances keep their sizes relative to the canonical one.
@@ -213,7 +213,7 @@ def instance_meshes(
     return category, vertices, faces, axis
 
 
-def _deformer(kind: str, level: float, cells: int) -> Deformer | None:
+def _deformer(kind: str, level: float, cells: int, double: bool) -> Deformer | None:
     """The deformer of a kind at a level of variation from 0 to 1."""
     if kind == "lattice":
         return LatticeDeformer(amplitude=0.08 * level, scale=0.2 * level, cells=cells)
@@ -224,7 +224,7 @@ def _deformer(kind: str, level: float, cells: int) -> Deformer | None:
     if kind == "dif_net":
         from iga_drake.shapes.deformers.dif_net import DifNetDeformer
 
-        return DifNetDeformer(scale=1.5 * level, stretch=0.2 * level)
+        return DifNetDeformer(scale=1.5 * level, stretch=0.2 * level, double=double)
     return None
 
 
@@ -403,14 +403,14 @@ def _observe(
         normals[:, role] = shape.normals[1:] @ np.swapaxes(R, -1, -2)
         near[role] = np.stack([alignments[m].near[role] for m in mode])
     spacing = np.stack([shape.spacing[1:] for shape in objects], 1)  # (N, 2)
-    clouds = _look(rng, points, normals, spacing, joint, chosen.noise, config)
+    clouds = _look(rng, points, normals, spacing, joint, chosen, config)
     if int(clouds.distinct.min()) < config.least_seen:
         return None
     index = clouds.index.numpy().transpose(1, 0, 2)  # (2, N, P)
     canonical = [shape.points[0] / np.ptp(shape.points[0], axis=0).max() for shape in objects]
     test_A, test_B = poses[:, -1]
     return Sample(
-        points=np.ascontiguousarray(clouds.points.numpy().transpose(1, 0, 2, 3)),
+        points=np.ascontiguousarray(clouds.points.numpy().transpose(1, 0, 2, 3), np.float32),
         canonical=np.stack([canonical[role][index[role]] for role in range(2)]).astype(np.float32),
         aligned=np.take_along_axis(near, index, 2),
         size=np.stack([np.ptp(s.points[1:], axis=1).max(1) for s in objects]).astype(np.float32),
@@ -427,10 +427,11 @@ def _look(
     normals: np.ndarray,
     spacing: np.ndarray,
     joint: bool,
-    noise: bool,
+    chosen: SampleSet,
     config: SampleConfig,
 ) -> Clouds:
     """Observed clouds (N, 2, ...) of surface points and normals (N, 2, S, 3)."""
+    dtype = np.float64 if chosen.double else np.float32
     N, S = len(points), points.shape[2]
     if joint:  # one rig about both
         cameras = camera_positions(rng, points.mean((1, 2)))
@@ -439,11 +440,11 @@ def _look(
         spacing = spacing.reshape(2 * N, 1)
         cameras = camera_positions(rng, points.mean((1, 2)))
     clouds = observe(
-        *(torch.from_numpy(a.astype(np.float32)) for a in (points, normals, cameras)),
-        spacing=torch.from_numpy(spacing.astype(np.float32)),
+        *(torch.from_numpy(a.astype(dtype)) for a in (points, normals, cameras)),
+        spacing=torch.from_numpy(spacing.astype(dtype)),
         voxel=config.voxel,
         count=config.cloud_points,
-        noise=DepthNoise() if noise else None,
+        noise=DepthNoise() if chosen.noise else None,
         generator=torch.Generator().manual_seed(int(rng.integers(1 << 62))),
     )
     P = config.cloud_points

@@ -38,6 +38,8 @@ class SampleSet:
     test_variation: tuple[float, float] | None = None  # of the test pair; None: as the others
     independent_share: float = 0.25  # of objects whose instances are unrelated products
     noise: bool = True  # of the depth cameras
+    # Cameras and DIF-Net in double precision: slower, and the same points on every machine.
+    double: bool = False
 
     def rng(self, stream: str, *key: int) -> np.random.Generator:
         """The generator of one of STREAMS for a key (sample index, role, ...)."""

@@ -1,6 +1,10 @@
 """Samples: pure, consistently aligned, honest about correspondence, modes and symmetry."""
 
 import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,6 +33,32 @@ def test_a_sample_is_a_pure_function_of_set_and_index(name: str) -> None:
     for field, value in _arrays(a).items():
         np.testing.assert_array_equal(value, getattr(b, field), err_msg=field)
     assert not np.array_equal(a.points, other.points)
+
+
+def test_an_evaluation_set_is_the_same_on_another_machine(tmp_path: Path) -> None:
+    """As far as one machine can show it: without the vector instructions that PyTorch uses here."""
+    script = (
+        "import sys, numpy as np, torch\n"
+        "from iga_drake.dataset.samples import make_sample\n"
+        "torch.set_num_threads(1)\n"
+        "samples = [make_sample('seen_alignments', k) for k in range(8)]\n"
+        "np.save(sys.argv[1], np.stack([s.points for s in samples]))\n"
+        "print(torch.backends.cpu.get_cpu_capability())\n"
+    )
+    clouds, capabilities = [], []
+    for name, extra in (("here", {}), ("there", {"ATEN_CPU_CAPABILITY": "default"})):
+        file = tmp_path / f"{name}.npy"
+        done = subprocess.run(
+            [sys.executable, "-c", script, str(file)],
+            env=os.environ | extra,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        capabilities.append(done.stdout.strip())
+        clouds.append(np.load(file))
+    assert capabilities[1] == "DEFAULT"
+    np.testing.assert_allclose(*clouds, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["train", "multi_modal", "diversity_high"])

@@ -31,9 +31,10 @@ def default_weights() -> Path:
 
 
 @lru_cache(maxsize=4)
-def _landed(path: Path) -> DifNet:
+def _landed(path: Path, double: bool) -> DifNet:
     with torch.random.fork_rng(devices=[]):  # making a network draws random numbers
-        return load_dif_net(path)[0]
+        net = load_dif_net(path)[0]
+        return net.double() if double else net
 
 
 class DifNetDeformer:
@@ -56,12 +57,14 @@ class DifNetDeformer:
         stretch: float = 0.0,
         least_volume: float = 0.2,
         checked_points: int = 128,
+        double: bool = False,
     ) -> None:
         """net: default, the package's weights. scale: factor of the displacement; latent_scale:
         factor of the latent's deviation from the mean of the trained ones; interpolate: between
         two trained latents instead of normal; stretch: sigma of log axis scales, drawn besides;
-        checked_points: at how many vertices folding is looked for (0: nowhere)."""
-        self.net = (_landed(default_weights()) if net is None else net).eval()
+        checked_points: at how many vertices folding is looked for (0: nowhere); double: the package's
+        weights in double precision."""
+        self.net = (_landed(default_weights(), double) if net is None else net).eval()
         if len(self.net.latents) < 2:
             raise ShapeError(
                 f"DifNetDeformer: {len(self.net.latents)} trained latents, at least 2 are needed"
@@ -77,7 +80,7 @@ class DifNetDeformer:
             self._deviations = self.net.latents - self._mean
 
     def draw_latent(self, rng: np.random.Generator) -> Tensor:
-        """(latent,) float32."""
+        """(latent,) in the precision of the network."""
         count = len(self._deviations)
         if self.interpolate:
             i, j = rng.choice(count, 2, replace=False)
@@ -87,7 +90,7 @@ class DifNetDeformer:
         else:
             # A normal combination of the deviations has their sample covariance.
             weights = rng.normal(size=count) / np.sqrt(count - 1)
-        mixed = torch.from_numpy(weights.astype(np.float32)) @ self._deviations
+        mixed = self._tensor(weights) @ self._deviations
         return self._mean + self.latent_scale * mixed
 
     def deform(self, shape: DeformableShape, seed: int) -> np.ndarray:
@@ -107,17 +110,19 @@ class DifNetDeformer:
         with torch.inference_mode():
             layers = self._layers(latent)
             scale = self._unfolded(layers, frame.apply(reference))
-            moved = siren(
-                layers, torch.from_numpy(normalised.astype(np.float32)), self.net.config.omega
-            )[:, :3].numpy()
+            moved = siren(layers, self._tensor(normalised), self.net.config.omega)[:, :3].numpy()
         return frame.invert((normalised + scale * moved) * stretch)
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        """In the precision of the network."""
+        return torch.from_numpy(array).to(self._mean.dtype)
 
     def _layers(self, latent: Tensor) -> Layers:
         return [(weight[0], bias[0]) for weight, bias in self.net.deformation_layers(latent[None])]
 
     def _jacobian(self, layers: Layers, vertices: np.ndarray) -> Tensor:
         """(V, 3, 3), transposed: d v_k / d p_j at [:, j, k], at normalised vertices (V, 3)."""
-        points = torch.from_numpy(vertices.astype(np.float32))[None]
+        points = self._tensor(vertices)[None]
         jacobian = siren_jacobian(layers, points, self.net.config.omega)[1]
         return jacobian[0, :, :, :3].transpose(0, 1)
 
@@ -147,5 +152,5 @@ class DifNetDeformer:
 
 def _determinants(jacobian: Tensor, scale: float) -> Tensor:
     """det(I + scale J) (V,), of (V, 3, 3); written out, much quicker than by factorisation."""
-    x, y, z = (torch.eye(3) + scale * jacobian).unbind(1)
+    x, y, z = (torch.eye(3, dtype=jacobian.dtype) + scale * jacobian).unbind(1)
     return (x * torch.linalg.cross(y, z)).sum(-1)
