@@ -15,6 +15,7 @@ from iga_drake.dataset import samples
 from iga_drake.dataset.depth_camera import visible
 from iga_drake.dataset.samples import make_sample
 from iga_drake.errors import IgaDrakeError
+from iga_drake.training.log import resident_memory
 
 # Stage: functions whose cumulative times add up to it.
 STAGES = {
@@ -33,12 +34,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true")
 
 
-def resident_mib() -> float:
-    """Memory of this process that is in use, MiB (Linux)."""
-    with open("/proc/self/statm", encoding="ascii") as file:
-        return int(file.read().split()[1]) * 4096 / 2**20
-
-
 def main(arguments: argparse.Namespace) -> int:
     """Prints samples/s on one thread, shares of the time, memory and the cameras' ratio."""
     if arguments.count < 1:
@@ -46,7 +41,7 @@ def main(arguments: argparse.Namespace) -> int:
     torch.set_num_threads(1)
     for k in range(10):  # warms up caches of faces and threads
         make_sample(arguments.set, arguments.first + k)
-    before = resident_mib()
+    before = resident_memory()["memory_mib"]
     seconds = []
     for k in range(arguments.count):
         began = time.perf_counter()
@@ -56,7 +51,7 @@ def main(arguments: argparse.Namespace) -> int:
         "samples_per_second": len(seconds) / sum(seconds),
         "median_ms": 1e3 * float(np.median(seconds)),
         "p95_ms": 1e3 * float(np.quantile(seconds, 0.95)),
-        "memory_growth_mib": resident_mib() - before,
+        "memory_growth_mib": resident_memory()["memory_mib"] - before,
         "stages": _stages(arguments.set, arguments.first, min(arguments.count, 100)),
         "cameras": _cameras(arguments.set, arguments.first),
     }

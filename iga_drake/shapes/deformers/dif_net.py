@@ -62,8 +62,8 @@ class DifNetDeformer:
         """net: default, the package's weights. scale: factor of the displacement; latent_scale:
         factor of the latent's deviation from the mean of the trained ones; interpolate: between
         two trained latents instead of normal; stretch: sigma of log axis scales, drawn besides;
-        checked_points: at how many vertices folding is looked for (0: nowhere); double: the package's
-        weights in double precision."""
+        checked_points: at how many vertices folding is looked for (0: nowhere); double: in double
+        precision, of the package's weights."""
         self.net = (_landed(default_weights(), double) if net is None else net).eval()
         if len(self.net.latents) < 2:
             raise ShapeError(

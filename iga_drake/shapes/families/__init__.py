@@ -1,7 +1,5 @@
 """Parametric families of objects, one module a kind; `FAMILIES` holds them all by name."""
 
-import numpy as np
-
 from iga_drake.shapes.families.bottles import BOTTLES
 from iga_drake.shapes.families.cleaning import CLEANING
 from iga_drake.shapes.families.containers import CONTAINERS
@@ -29,9 +27,3 @@ _GROUPS: tuple[tuple[Family, ...], ...] = (
 )
 
 FAMILIES: dict[str, Family] = {family.name: family for group in _GROUPS for family in group}
-
-
-def draw(name: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """One product of a family: vertices (V, 3) m and faces (F, 3)."""
-    surface = FAMILIES[name].surface(FAMILIES[name].sample_parameters(rng))
-    return surface.vertices, surface.faces
