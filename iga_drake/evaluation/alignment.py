@@ -167,7 +167,7 @@ def evaluate_alignment(
     if count < 1:
         raise IgaDrakeError(f"count {count}: at least 1 sample is needed")
     name = aligner.name if aligner else ORACLE
-    done = _read_results(results, version) if results else {}
+    done = _read_results(results, name, version) if results else {}
     rows: list[SampleErrors] = []
     for index in range(count):
         row = done.get((name, split, index))
@@ -216,8 +216,10 @@ def by_category(rows: Iterable[SampleErrors]) -> str:
     return "\n".join(lines)
 
 
-def _read_results(path: Path, version: str) -> dict[tuple[str, str, int], SampleErrors]:
-    """Finished samples of a results file; a torn last line is left out."""
+def _read_results(
+    path: Path, aligner: str, version: str
+) -> dict[tuple[str, str, int], SampleErrors]:
+    """An aligner's finished samples in a results file; a torn last line is left out."""
     done: dict[tuple[str, str, int], SampleErrors] = {}
     if not path.is_file():
         return done
@@ -234,7 +236,9 @@ def _read_results(path: Path, version: str) -> dict[tuple[str, str, int], Sample
             raise IgaDrakeError(
                 f"{path}, line {number}: not a result of this command ({error}); name another file"
             ) from error
-        if row.aligner not in ("icp", ORACLE) and found != version:
+        if row.aligner != aligner:
+            continue
+        if found != version:
             raise IgaDrakeError(
                 f"{path}, line {number}: made with weights {found}, not {version}: "
                 "name another file"
