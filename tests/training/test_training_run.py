@@ -68,7 +68,7 @@ def test_a_run_learns_and_logs(tmp_path: Path) -> None:
     assert rows[-1]["loss"] < 1e-2 * rows[0]["loss"] and rows[0]["largest"] > rows[0]["loss"]
     assert rows[-1]["gradient_norm"] < 0.2 * rows[0]["gradient_norm"]
     row = json.loads((tmp_path / "log.jsonl").read_text().splitlines()[0])
-    assert row["samples_per_second"] > 0 and row["workers_mib"] == 0
+    assert row["samples_per_second"] > 0 and row["memory_mib"] > 10 and row["workers_mib"] >= 0
     # Of the whole process, that of Python with PyTorch at the least.
     assert 50 < row["memory_mib"] < 1e5
 
