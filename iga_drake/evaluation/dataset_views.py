@@ -223,18 +223,9 @@ def view_dataset(arguments: argparse.Namespace) -> int:
         write_png(sample_sheet(samples, coloring=arguments.colors), arguments.png)
         print(f"written: {arguments.png}")
     if arguments.html or not arguments.png:
-        from iga_drake.evaluation.replay import quiet_meshcat, write_html
+        from iga_drake.evaluation.replay import quiet_meshcat, write_or_serve
 
         meshcat = quiet_meshcat()
         show_samples(meshcat, samples, first=arguments.index, coloring=arguments.colors)
-        if arguments.html:
-            meshcat.Flush()
-            write_html(meshcat, arguments.html)
-            print(f"written: {arguments.html}")
-        else:
-            print(f"open {meshcat.web_url()} in a browser; press Enter to end", flush=True)
-            try:
-                input()
-            except EOFError:
-                pass
+        write_or_serve(meshcat, arguments.html)
     return 0

@@ -458,18 +458,9 @@ def view_energy(arguments: argparse.Namespace) -> int:
         for path in write_figures(scene, field, arguments.out):
             print(f"written: {path}")
     if arguments.html or not arguments.out:
-        from iga_drake.evaluation.replay import quiet_meshcat, write_html
+        from iga_drake.evaluation.replay import quiet_meshcat, write_or_serve
 
         meshcat = quiet_meshcat()
         show_scene(meshcat, scene, field)
-        if arguments.html:
-            meshcat.Flush()
-            write_html(meshcat, arguments.html)
-            print(f"written: {arguments.html}")
-        else:
-            print(f"open {meshcat.web_url()} in a browser; press Enter to end", flush=True)
-            try:
-                input()
-            except EOFError:
-                pass
+        write_or_serve(meshcat, arguments.html)
     return 0

@@ -109,12 +109,22 @@ def demonstrations_html(demonstrations: DemonstrationSet) -> str:
     return meshcat.StaticHtml()
 
 
-def serve_demonstrations(demonstrations: DemonstrationSet) -> None:
-    """Shows all demonstrations at an address that is printed, until Enter is pressed."""
-    meshcat = quiet_meshcat()
-    show_demonstrations(meshcat, demonstrations)
-    print(f"open {meshcat.web_url()} in a browser; press Enter to end")
+def write_or_serve(meshcat: Meshcat, html: Path | None) -> None:
+    """Writes what is shown as a page, or prints its address and serves until Enter is pressed."""
+    if html is not None:
+        meshcat.Flush()
+        write_html(meshcat, html)
+        print(f"written: {html}")
+        return
+    print(f"open {meshcat.web_url()} in a browser; press Enter to end", flush=True)
     try:
         input()
     except EOFError:
         pass
+
+
+def serve_demonstrations(demonstrations: DemonstrationSet) -> None:
+    """Shows all demonstrations at an address that is printed, until Enter is pressed."""
+    meshcat = quiet_meshcat()
+    show_demonstrations(meshcat, demonstrations)
+    write_or_serve(meshcat, None)
