@@ -357,7 +357,7 @@ def _evaluate_tasks(arguments: argparse.Namespace) -> int:
 # `main(arguments) -> int`
 
 DELEGATES = ("benchmark", "dataset", "evaluate", "shapes", "train", "view")
-BENCHMARKS = ("data", "fusion", "inference", "ik")
+BENCHMARKS = ("data", "fusion", "inference", "ik", "paper-energy")
 
 
 def _delegate(module: str) -> Any:
@@ -374,7 +374,8 @@ def _add_benchmark(parser: argparse.ArgumentParser) -> None:
 
 
 def _benchmark(arguments: argparse.Namespace) -> int:
-    module = _delegate(f"iga_drake.evaluation.benchmark_{arguments.what}")
+    name = arguments.what.replace("-", "_")
+    module = _delegate(f"iga_drake.evaluation.benchmark_{name}")
     return _run_delegate(module, f"iga benchmark {arguments.what}", arguments.options)
 
 

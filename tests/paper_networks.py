@@ -1,0 +1,41 @@
+"""Small random graph networks and problems. Shared by tests."""
+
+import torch
+
+from iga_drake.aligners.iga_paper.graph import GraphConfig, GraphNetwork, Nodes
+from iga_drake.aligners.iga_paper.langevin import haar_rotations
+
+SMALL = GraphConfig(heads=2, head_width=8, convolutions=3, hidden=16, frequencies=3, nodes=4)
+CHANNELS = 5
+
+
+def network(config: GraphConfig = SMALL, *, outputs: int = 1, seed: int = 0) -> GraphNetwork:
+    """With random biases, too."""
+    torch.manual_seed(seed)
+    net = GraphNetwork(config, channels=CHANNELS, outputs=outputs)
+    for name, parameter in net.named_parameters():
+        if name.endswith("bias"):
+            parameter.data.normal_(std=0.3)
+    return net
+
+
+def nodes(*lead: int, count: int = SMALL.nodes) -> Nodes:
+    return Nodes(0.1 * torch.randn(*lead, count, 3), 3 * torch.randn(*lead, count, 3, CHANNELS))
+
+
+def problem(S: int = 2, N: int = 3, M: int = 5) -> tuple:
+    """Demonstrations (S, N, K), test (S, K), poses R (S, M, 3, 3), t (S, M, 3)."""
+    return (
+        (nodes(S, N), nodes(S, N)),
+        (nodes(S), nodes(S)),
+        haar_rotations(S, M),
+        0.2 * torch.randn(S, M, 3),
+    )
+
+
+def double(nested):
+    """Tensors of nested tuples in double precision."""
+    if isinstance(nested, torch.Tensor):
+        return nested.double()
+    items = [double(item) for item in nested]
+    return type(nested)(*items) if hasattr(nested, "_fields") else tuple(items)
