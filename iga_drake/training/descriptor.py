@@ -203,6 +203,8 @@ def train_descriptor(
         options=options,
         validate=functools.partial(_alignment_errors, model=model, count=config.validation_samples),
     )
+    if options is not None and options.compile:
+        net.compile_layers()
     batches = iter(
         sample_loader(
             "train",

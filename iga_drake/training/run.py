@@ -24,6 +24,7 @@ from iga_drake.training.ranks import Ranks
 from iga_drake.training.settings import TrainingError
 
 DECAYS = ("linear", "cosine")
+OPTIMIZERS = ("adamw", "muon")
 BETAS = (0.9, 0.98)
 
 
@@ -34,6 +35,9 @@ class RunConfig:
     batch: int = 6  # samples of a forward pass of one process
     accumulate: int = 1  # forward passes of one process in a step
     steps: int = 6000
+    # adamw (Loshchilov & Hutter 2019), or muon (Jordan et al. 2024): matrices by momentum made
+    # orthogonal, at steps of AdamW's size, and all else by AdamW.
+    optimizer: str = "adamw"
     learning_rate: float = 1.5e-3
     warmup: int = 150
     decay_share: float = 0.35  # of the steps, at the end
@@ -51,8 +55,11 @@ class RunConfig:
         for name in ("batch", "accumulate", "steps", "log_every", "validation_samples"):
             if getattr(self, name) < 1:
                 raise TrainingError(f"{name} = {getattr(self, name)}, must be at least 1")
-        if self.decay not in DECAYS:
-            raise TrainingError(f"decay = '{self.decay}', must be one of: {', '.join(DECAYS)}")
+        for name, allowed in (("decay", DECAYS), ("optimizer", OPTIMIZERS)):
+            if getattr(self, name) not in allowed:
+                raise TrainingError(
+                    f"{name} = '{getattr(self, name)}', must be one of: {', '.join(allowed)}"
+                )
 
 
 @dataclass(frozen=True)
@@ -87,6 +94,9 @@ class RunOptions:
     checkpoint_every: int = 200  # steps
     checkpoint_minutes: float = 5.0  # or after this long, what comes first
     tensorboard: bool = False
+    # Layers compiled to machine code at the start: minutes once, then faster steps (CPU, C++
+    # compiler needed); equal up to rounding.
+    compile: bool = False
 
 
 def learning_rate(step: int, config: RunConfig) -> float:
@@ -95,6 +105,20 @@ def learning_rate(step: int, config: RunConfig) -> float:
     if config.decay == "cosine":
         left = (1 - math.cos(math.pi * left)) / 2
     return config.learning_rate * min(1.0, (step + 1) / max(1, config.warmup), max(0.02, left))
+
+
+def make_optimizers(
+    parameters: Iterable[nn.Parameter], config: RunConfig
+) -> list[torch.optim.Optimizer]:
+    """Those that together make a step."""
+    rate, decay = config.learning_rate, config.weight_decay
+    parameters = list(parameters)
+    if config.optimizer == "adamw":
+        return [torch.optim.AdamW(parameters, lr=rate, weight_decay=decay, betas=BETAS)]
+    matrices = [p for p in parameters if p.ndim == 2]
+    others = [p for p in parameters if p.ndim != 2]
+    muon = torch.optim.Muon(matrices, lr=rate, weight_decay=decay, adjust_lr_fn="match_rms_adamw")
+    return [muon, torch.optim.AdamW(others, lr=rate, weight_decay=decay, betas=BETAS)]
 
 
 class TrainingRun:
@@ -127,12 +151,7 @@ class TrainingRun:
         self._named = dict(net.named_parameters())
         self._device = next(net.parameters()).device
         self.ranks = Ranks(self._device)
-        self._optimizer = torch.optim.AdamW(
-            net.parameters(),
-            lr=config.learning_rate,
-            weight_decay=config.weight_decay,
-            betas=BETAS,
-        )
+        self._optimizers = make_optimizers(net.parameters(), config)
         # Sums of the statistics since the last row of the log, and their number.
         self._sums: dict[str, Tensor] = {}
         self._summed = 0
@@ -162,11 +181,16 @@ class TrainingRun:
         self.samples_seen = card["samples_seen"]
         for name, parameter in self._named.items():
             parameter.data.copy_(tensors[f"net.{name}"])
-            self._optimizer.state[parameter] = {
-                "step": torch.tensor(float(self.step)),
-                "exp_avg": tensors[f"m.{name}"].to(self._device),
-                "exp_avg_sq": tensors[f"v.{name}"].to(self._device),
-            }
+            state = self._state_of(parameter)
+            first, second = (tensors.get(f"{k}.{name}") for k in "mv")
+            if first is None:
+                continue
+            if self._by_muon(parameter):
+                state["momentum_buffer"] = first.to(self._device)
+            elif second is not None:  # else it was made by the other optimizer: starts anew
+                state["step"] = torch.tensor(float(self.step))
+                state["exp_avg"] = first.to(self._device)
+                state["exp_avg_sq"] = second.to(self._device)
         self.ema = {n: tensors[f"ema.{n}"].to(self._device) for n in self._named}
         torch.set_rng_state(tensors["rng"])
         since = card.get("since_row", {"count": 0, "sums": {}})
@@ -176,6 +200,15 @@ class TrainingRun:
             for k, v in since["sums"].items()
         }
         self._errors = card.get("errors", {})
+
+    def _by_muon(self, parameter: nn.Parameter) -> bool:
+        return self.config.optimizer == "muon" and parameter.ndim == 2
+
+    def _state_of(self, parameter: nn.Parameter) -> dict:
+        """The optimizer's, to read or fill."""
+        return self._optimizers[
+            0 if self.config.optimizer == "adamw" or self._by_muon(parameter) else 1
+        ].state[parameter]
 
     @property
     def seconds(self) -> float:
@@ -199,9 +232,10 @@ class TrainingRun:
         """Makes one step from this process's `terms`, each of its own forward pass; then logs,
         validates and saves what is due. Returns the row of the log, if one was due."""
         rate = learning_rate(self.step, self.config)
-        for group in self._optimizer.param_groups:
-            group["lr"] = rate
-        self._optimizer.zero_grad(set_to_none=True)
+        for optimizer in self._optimizers:
+            for group in optimizer.param_groups:
+                group["lr"] = rate
+            optimizer.zero_grad(set_to_none=True)
         sums: dict[str, Tensor] = {}
         for term in terms:
             term.total.backward()
@@ -212,7 +246,8 @@ class TrainingRun:
         statistics = self._average_gradients(sums)
         clipped = nn.utils.clip_grad_norm_(self.net.parameters(), self.config.clip)
         statistics["gradient_norm"] = clipped.detach()
-        self._optimizer.step()
+        for optimizer in self._optimizers:
+            optimizer.step()
         self.step += 1
         self.samples_seen += self.config.batch * self.config.accumulate * self.ranks.world
         rate = min(self.config.ema, (1 + self.step) / (10 + self.step))
@@ -299,7 +334,10 @@ class TrainingRun:
             state |= {f"ema.{n}": t for n, t in self.ema.items()}
             for n, p in self._named.items():
                 # A parameter that feeds nothing has no gradient and no moments.
-                moments = self._optimizer.state.get(p, {})
+                moments = self._state_of(p)
+                if self._by_muon(p):
+                    state[f"m.{n}"] = moments.get("momentum_buffer", torch.zeros_like(p))
+                    continue
                 state[f"m.{n}"] = moments.get("exp_avg", torch.zeros_like(p))
                 state[f"v.{n}"] = moments.get("exp_avg_sq", torch.zeros_like(p))
             state["rng"] = torch.get_rng_state()

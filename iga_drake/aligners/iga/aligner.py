@@ -15,11 +15,14 @@ import torch
 from torch import Tensor
 
 from iga_drake.aligners.iga.descriptor import DescriptorNet
+from iga_drake.aligners.iga.energy import PairEnergyNet, SearchConfig, minimise, pair_proposals
 from iga_drake.aligners.iga.voting import Match, VotingConfig, cast_votes, match_object, modes
 from iga_drake.aligners.protocol import AlignerError, Alignment, PoseEstimate, check_cloud
 from iga_drake.geometry.clouds import furthest_point_sampling
 from iga_drake.geometry.se3 import rigid
 from iga_drake.paths import models_dir
+
+LANDED = "landed"
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,8 @@ class Explanation:
 
     estimate: PoseEstimate
     nodes: Tensor  # (2, D + 1, M, 3) m, in the frames of the clouds as given
+    centres: Tensor  # (2, 3) m, the test clouds' centroids, in their frames
+    voted: Tensor  # (n, 4, 4) modes of the vote, best first, X_WF
     index: Tensor  # (2, D + 1, M) which point of its cloud every node is
     logits: Tensor  # (2, D, M, M) of the test nodes' matches with the demonstrations' nodes
     matches: tuple[list[Match], list[Match]]  # test nodes about their cloud's centroid
@@ -58,11 +63,16 @@ def default_weights() -> Path:
     return models_dir() / "weights" / "descriptor.safetensors"
 
 
-class IgaAligner:
-    """`Aligner` by dense SE(3)-invariant correspondence and consistency voting.
+def default_energy() -> Path:
+    """The landed checkpoint of the energy."""
+    return models_dir() / "weights" / "energy.safetensors"
 
-    In place of the paper's learned energy stands the agreement of closed-form proposals over the
-    demonstrations.
+
+class IgaAligner:
+    """`Aligner` by dense SE(3)-invariant correspondence, consistency voting, and the learned
+    factorised energy that ranks and refines what they propose.
+
+    Without an energy the vote's own agreement takes its place.
     """
 
     name = "iga"
@@ -72,22 +82,31 @@ class IgaAligner:
         net: DescriptorNet | None = None,
         *,
         weights: Path | str | None = None,
+        energy: PairEnergyNet | Path | str | None = LANDED,
         config: IgaConfig | None = None,
         voting: VotingConfig | None = None,
+        search: SearchConfig | None = None,
     ):
-        """Takes a network, or reads `weights` (default: the landed checkpoint).
+        """Takes a network, or reads `weights` (default: the landed checkpoint); likewise `energy`
+        (None: voting alone).
 
-        The network itself is left as it is. Raises `CheckpointError` (`checkpoint`) for a
+        The networks themselves are left as they are. Raises `CheckpointError` (`checkpoint`) for a
         missing or foreign file.
         """
-        if net is None:
-            from iga_drake.aligners.iga.weights import load_descriptor
+        from iga_drake.aligners.iga.weights import load_descriptor, load_energy
 
+        if net is None:
             net, _ = load_descriptor(Path(weights) if weights else default_weights())
+        if energy == LANDED and not default_energy().is_file():  # TEMPORARY
+            energy = None
+        if isinstance(energy, (str, Path)):
+            energy, _ = load_energy(default_energy() if energy == LANDED else Path(energy))
+        self._energy = copy.deepcopy(energy).eval().double() if energy is not None else None
         # Double precision: choices between near ties must not depend on the clouds' frame.
         self._net = copy.deepcopy(net).eval().double()
         self.config = config or IgaConfig()
         self.voting = voting or VotingConfig()
+        self.search = search or SearchConfig()
 
     @property
     def net(self) -> DescriptorNet:
@@ -115,7 +134,7 @@ class IgaAligner:
         *,
         seed: int = 0,
     ) -> PoseEstimate:
-        """See `Aligner.align`. Energies are minus the log of the support of a mode."""
+        """See `Aligner.align`."""
         return self.explain(context, grasped, target, seed=seed).estimate
 
     @torch.no_grad()
@@ -161,13 +180,24 @@ class IgaAligner:
         )
         matched = time.perf_counter()
         votes = cast_votes(A, B, test[0, : self.voting.parts], self.voting)
-        X, energy = modes(votes)
-        voted = time.perf_counter()
-        probability = (-(energy - energy.min())).softmax(0).numpy()
+        X, energies = modes(votes)
+        voted, voted_at = X, time.perf_counter()
+        energy: Callable[[Tensor], Tensor] = votes.energy
+        pair_weights: Callable[[Tensor], Tensor] = votes.pair_weights
+        if self._energy is not None:
+            prepared = self._energy(
+                pair_proposals(A, B, test[0], test[1], self._energy.config, self.voting)
+            )
+            X, energies = minimise(prepared, also=voted, config=self.search)
+            energy, pair_weights = prepared, prepared.pair_weights
+        ranked = time.perf_counter()
+        probability = (-(energies - energies.min())).softmax(0).numpy()
         keep = probability >= self.config.minimum_probability * probability.max()
         centre_A, centre_B = centre[half - 1 :: half]
-        poses = X.numpy()[keep]
-        poses[:, :3, 3] += centre_B.numpy() - poses[:, :3, :3] @ centre_A.numpy()
+
+        def as_given(X: Tensor) -> Tensor:
+            R = X[..., :3, :3]
+            return rigid(R, X[..., :3, 3] + centre_B - R @ centre_A)
 
         def about_centroids(X: Tensor) -> Tensor:
             R = X[..., :3, :3]
@@ -175,19 +205,24 @@ class IgaAligner:
 
         return Explanation(
             estimate=PoseEstimate(
-                poses, energy.numpy()[keep], probability[keep] / probability[keep].sum()
+                as_given(X).numpy()[keep],
+                energies.numpy()[keep],
+                probability[keep] / probability[keep].sum(),
             ),
             nodes=goal,
+            centres=torch.stack((centre_A, centre_B)),
+            voted=as_given(voted),
             index=index,
             logits=found,
             matches=(A, B),
             proposals=votes.proposals,
-            energy=lambda X: votes.energy(about_centroids(X)),
-            pair_weights=lambda X: votes.pair_weights(about_centroids(X)),
+            energy=lambda X: energy(about_centroids(X)),
+            pair_weights=lambda X: pair_weights(about_centroids(X)),
             seconds={
                 "describe": described - began,
                 "match": matched - described,
-                "vote": voted - matched,
+                "vote": voted_at - matched,
+                "energy": ranked - voted_at,
             },
         )
 

@@ -3,9 +3,11 @@
 from pathlib import Path
 
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
+from iga_drake.aligners.iga.energy import EnergyConfig, PairEnergyNet
 from iga_drake.checkpoint import CheckpointError, load_checkpoint
 
 DESCRIPTOR = "descriptor"
+ENERGY = "energy"
 
 
 def descriptor_config(card: dict) -> DescriptorConfig:
@@ -26,6 +28,21 @@ def load_descriptor(path: Path) -> tuple[DescriptorNet, dict]:
         raise CheckpointError(
             f"{path}: card and tensors don't describe this release's network ({error}): train one "
             "with `iga train` or name another"
+        ) from error
+    net.eval().requires_grad_(False)
+    return net, card
+
+
+def load_energy(path: Path) -> tuple[PairEnergyNet, dict]:
+    """The trained energy (evaluation mode) and its card; raises `CheckpointError`."""
+    tensors, card = load_checkpoint(path, kind=ENERGY)
+    try:
+        net = PairEnergyNet(EnergyConfig(**card["model"]))
+        net.load_state_dict(tensors)
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise CheckpointError(
+            f"{path}: card and tensors don't describe this release's energy ({error}): train one "
+            "with `iga train energy` or name another"
         ) from error
     net.eval().requires_grad_(False)
     return net, card
