@@ -20,9 +20,11 @@ def furthest_point_sampling(points: Tensor, count: int, start: Tensor | None = N
     rows = torch.arange(B, device=points.device)
     distance = torch.full((B, P), torch.inf, dtype=points.dtype, device=points.device)
     index = start
+    x = points.mT.contiguous()  # (B, 3, P)
     for k in range(count):
         chosen[:, k] = index
-        distance = torch.minimum(distance, (points - points[rows, index, None]).square().sum(-1))
+        gap = x - x[rows, :, index, None]
+        distance = torch.minimum(distance, gap.square_().sum(1))
         index = distance.argmax(1)
     return chosen
 
