@@ -16,7 +16,7 @@ from torch import Tensor
 
 from iga_drake.aligners.iga.descriptor import DescriptorNet
 from iga_drake.aligners.iga.energy import PairEnergyNet, SearchConfig, minimise, pair_proposals
-from iga_drake.aligners.iga.voting import Match, VotingConfig, cast_votes, match_object, modes
+from iga_drake.aligners.iga.voting import Match, VotingConfig, cast_votes, match_objects, modes
 from iga_drake.aligners.protocol import AlignerError, Alignment, PoseEstimate, check_cloud
 from iga_drake.geometry.clouds import furthest_point_sampling
 from iga_drake.geometry.se3 import rigid
@@ -102,15 +102,16 @@ class IgaAligner:
         if isinstance(energy, (str, Path)):
             energy, _ = load_energy(default_energy() if energy == LANDED else Path(energy))
         self._energy = copy.deepcopy(energy).eval().double() if energy is not None else None
-        # Double precision: choices between near ties must not depend on the clouds' frame.
-        self._net = copy.deepcopy(net).eval().double()
+        # Double precision where it counts: choices between near ties must not depend on the clouds'
+        # frames.
+        self._net = copy.deepcopy(net).eval().mixed_precision()
         self.config = config or IgaConfig()
         self.voting = voting or VotingConfig()
         self.search = search or SearchConfig()
 
     @property
     def net(self) -> DescriptorNet:
-        """The aligner's own copy of the network, in double precision."""
+        """The aligner's own copy of the network, in mixed precision."""
         return self._net
 
     def _prepare(self, cloud: np.ndarray, seed: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -171,13 +172,14 @@ class IgaAligner:
         # A demonstration's two objects share one frame: their centroids are put back.
         goal = (nodes + centre[:, None]).unflatten(0, (2, half))
         test = nodes[half - 1 :: half]  # (2, M, 3)
-        A, B = (
-            [
-                match_object(found[role, d], test[role], goal[role, d], self.voting, generator)
-                for d in range(half - 1)
-            ]
-            for role in range(2)
+        matches = match_objects(
+            found.flatten(0, 1),
+            test.repeat_interleave(half - 1, 0),
+            goal[:, :-1].flatten(0, 1),
+            self.voting,
+            generator,
         )
+        A, B = matches[: half - 1], matches[half - 1 :]
         matched = time.perf_counter()
         votes = cast_votes(A, B, test[0, : self.voting.parts], self.voting)
         X, energies = modes(votes)
@@ -229,5 +231,5 @@ class IgaAligner:
     def _logits(self, points: Tensor, chosen: Tensor) -> Tensor:
         """(2, D, M, M) of the test nodes' matches, learned; clouds (2 (D + 1), P, 3)."""
         half = len(points) // 2
-        descriptors = self._net(points, chosen, group=half).unflatten(0, (2, half))
+        descriptors = self._net(points, chosen, group=half).double().unflatten(0, (2, half))
         return self._net.similarity(descriptors[:, -1:], descriptors[:, :-1])

@@ -66,11 +66,14 @@ class LocalMoments(nn.Module):
         B, M, _ = p.shape
         S = len(self.radii)
         distance = torch.cdist(p, x)[:, :, None]  # (B, M, 1, P)
-        r = self.radii[:, None]
+        r = self.radii.to(x.dtype)[:, None]
         # Compact window of each shell: (1 - ((d - r) / 0.9 r)^2)_+^2, in place (no parameters).
-        window = ((distance - r) / (0.9 * r)).square_().neg_().add_(1).clamp_min_(0).square_()
+        window = (distance * (1 / (0.9 * r))).sub_(1 / 0.9)
+        window = window.square_().neg_().add_(1).clamp_min_(0).square_()
         outer = (x[..., :, None] * x[..., None, :]).flatten(2)
-        moments = window.flatten(1, 2) @ torch.cat((torch.ones_like(x[..., :1]), x, outer), -1)
+        powers = torch.cat((torch.ones_like(x[..., :1]), x, outer), -1)
+        # In this order (few rows, not few columns) it is quicker.
+        moments = (powers.mT @ window.flatten(1, 2).mT).mT
         moments = moments.reshape(B, M, S, 13) / x.shape[1]
         mass = moments[..., :1].clamp_min(1e-5)
         mean = moments[..., 1:4] / mass
@@ -102,7 +105,14 @@ class LocalMoments(nn.Module):
             ),
             -1,
         )
-        return self.embed(invariants), v_out
+        return self.embed(invariants.to(next(self.embed.parameters()).dtype)), v_out
+
+
+class _OnChannels(nn.Linear):
+    """A linear layer on the channels of x (B, C, N)."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (self.weight @ x).add_(self.bias[:, None])
 
 
 class ContextLayer(nn.Module):
@@ -117,9 +127,9 @@ class ContextLayer(nn.Module):
         self.qkv = nn.Linear(d, 3 * d)
         self.direction = VectorLinear(c, self.probe)
         self.pair = nn.Sequential(
-            nn.Linear(config.distance_bases + 2 * self.probe, config.pair_hidden),
+            _OnChannels(config.distance_bases + 2 * self.probe, config.pair_hidden),
             nn.GELU(),
-            nn.Linear(config.pair_hidden, 2 * h),
+            _OnChannels(config.pair_hidden, 2 * h),
         )
         self.value_v = VectorLinear(c, c)
         self.out = nn.Linear(d, d)
@@ -131,26 +141,35 @@ class ContextLayer(nn.Module):
         self.vector_out = VectorLinear(c + h, c)
         self.self_mix = VectorLinear(2 * c, c)
 
+    def _pair(self, v: Tensor, p: Tensor, bases: Tensor, shrink: Tensor) -> Tensor:
+        """(B, 2h, M, M) of invariant features of every pair of nodes; see `forward`."""
+        B, M, _ = p.shape
+        probe = self.direction(v).transpose(2, 3)  # (B, M, probes, 3)
+        with torch.autocast(p.device.type, enabled=False):  # differences of positions
+            probe = probe.to(p.dtype)
+            start = (probe @ p[..., None]).reshape(B, M * self.probe, 1)
+            along = torch.baddbmm(start, probe.flatten(1, 2), p.mT, beta=-1)
+            along = along.reshape(B, M, self.probe, M).transpose(1, 2) * shrink
+            along = along.to(bases.dtype)
+        features = torch.cat((bases, along, -along.mT), 1).flatten(2)  # (B, K + 2 probes, M M)
+        return self.pair(features).unflatten(-1, (M, M))
+
     def forward(
-        self, s: Tensor, v: Tensor, bases: Tensor, unit: Tensor, relative: Tensor
+        self, s: Tensor, v: Tensor, p: Tensor, bases: Tensor, shrink: Tensor
     ) -> tuple[Tensor, Tensor]:
-        # s (B, M, d), v (B, M, 3, c), bases (B, M, M, K), unit and relative (B, M, M, 3): j - i
+        # s (B, M, d), v (B, M, 3, c), p (B, M, 3), bases (B, K, M, M), shrink (B, 1, M, M): factor
+        # that turns p_j - p_i into a direction
         B, M, d = s.shape
         h, c = self.heads, v.shape[-1]
-        probe = self.direction(v)  # (B, M, 3, probes)
-        along_i = unit @ probe  # (B, M, M, probes)
-        along_j = (unit.transpose(1, 2) @ probe).transpose(1, 2)
-        pair = self.pair(torch.cat((bases, along_i, along_j), -1))  # (B, M, M, 2h)
-        bias, gate = pair.permute(0, 3, 1, 2).split(h, 1)  # (B, h, M, M)
+        bias, gate = self._pair(v, p, bases, shrink).split(h, 1)  # (B, h, M, M)
         q, k, value = self.qkv(self.norm(s)).reshape(B, M, 3, h, self.width).permute(2, 0, 3, 1, 4)
         attention = (q @ k.transpose(-1, -2) / self.width**0.5 + bias).softmax(-1)
         s = s + self.out((attention @ value).transpose(1, 2).reshape(B, M, d))
         value_v = self.value_v(v).reshape(B, M, 3, h, c // h).permute(0, 3, 1, 2, 4)
-        moved = (attention @ value_v.flatten(3)).reshape(B, h, M, 3, c // h)
+        moved = (attention.to(value_v.dtype) @ value_v.flatten(3)).reshape(B, h, M, 3, c // h)
         moved = moved.permute(0, 2, 3, 1, 4).reshape(B, M, 3, c)
         # sum_j g_ij (p_j - p_i), without the (B, h, M, M, 3) products
         weight = attention * gate
-        p = relative[:, 0]  # positions up to a common shift
         with torch.autocast(p.device.type, enabled=False):
             weight = weight.to(p.dtype)
             pull = weight @ p[:, None] - weight.sum(-1, keepdim=True) * p[:, None]  # (B, h, M, 3)
@@ -160,7 +179,8 @@ class ContextLayer(nn.Module):
         invariants = torch.cat(
             [(x * y).sum(-2) for x, y in ((e1, e3), (e2, e3), (cross, e3), (v, message))], -1
         )
-        update, gates = self.mlp(self.norm2(torch.cat((s, invariants), -1))).split((d, 2 * c), -1)
+        seen = self.norm2(torch.cat((s, invariants.to(s.dtype)), -1))
+        update, gates = self.mlp(seen).split((d, 2 * c), -1)
         s = s + update
         g1, g2 = gates[:, :, None].chunk(2, -1)
         v = (
@@ -238,16 +258,27 @@ class DescriptorNet(nn.Module):
         p = torch.gather(x, 1, nodes[..., None].expand(-1, -1, 3))  # (B, M, 3)
         with torch.autocast(points.device.type, enabled=False):  # differences of positions
             s, v = self.local(x, p)
-        relative = p[:, None] - p[:, :, None]  # (B, M, M, 3)
-        length = relative.square().sum(-1, keepdim=True).add(1e-8).sqrt()
-        unit = relative / (length + 0.02)
-        centres = torch.linspace(0, 3.0, cfg.distance_bases, device=p.device, dtype=p.dtype)
-        bases = torch.exp(-((length - centres) ** 2) / (2 * 0.3**2))
+        gap = p.mT[:, :, None] - p.mT[..., None]  # (B, 3, M, M)
+        length = gap.square().sum(1, keepdim=True).add(1e-8).sqrt()
+        shrink = 1 / (length + 0.02)
+        centres = torch.linspace(0, 3.0, cfg.distance_bases, device=p.device, dtype=s.dtype)
+        bases = torch.exp((length.to(s.dtype) - centres[:, None, None]) ** 2 / (-2 * 0.3**2))
         for k, layer in enumerate(self.layers):
             if k and self.cross and group > 1:
                 s = self.cross[k - 1](s, group)
-            s, v = layer(s, v, bases, unit, relative)
+            s, v = layer(s, v, p, bases, shrink)
         return nn.functional.normalize(self.head(s), dim=-1)
+
+    def mixed_precision(self) -> "DescriptorNet":
+        """In place: double precision for all that turns with the clouds, single for invariants.
+
+        For clouds in double precision. What is single doesn't depend on the clouds' frames.
+        """
+        self.float()
+        for module in self.modules():
+            if isinstance(module, VectorLinear):
+                module.double()
+        return self
 
     def compile_layers(self) -> None:
         """Compiles the costly layers in place (`torch.compile`); parameters keep their names."""

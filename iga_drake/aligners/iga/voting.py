@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from iga_drake.geometry.se3 import (
-    geodesic_angle,
     inverse,
     kabsch,
     nearest_rotation,
@@ -106,23 +105,50 @@ class Votes:
         return torch.zeros(P * Q).to(share).index_add(0, self.pair, share).reshape(P, Q)
 
 
-def _unit(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    centre = points.mean(0)
-    scale = (points - centre).square().sum(-1).mean().sqrt()
-    return (points - centre) / scale, centre, scale
+def _unit(points: Tensor) -> Tensor:
+    """Clouds (B, M, 3) about their centroids in units of their root-mean-square radius."""
+    points = points - points.mean(1, keepdim=True)
+    return points / points.square().sum(-1, keepdim=True).mean(1, keepdim=True).sqrt()
 
 
-def _assign(log_p: Tensor, moved: Tensor, y: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
-    """Probabilities (H, M, N) of the matches of test nodes moved (H, M, 3) onto y (N, 3), and
-    log-likelihoods (H, M)."""
-    logits = log_p - torch.cdist(moved, y.expand(len(moved), -1, -1)).square() / (2 * sigma**2)
-    return logits.softmax(-1), logits.logsumexp(-1)
+def _closeness(a: Tensor, b: Tensor, sigma: float) -> Tensor:
+    """exp(-|a_i - b_j|^2 / (2 sigma^2)), (n, m), of points (n, k) and (m, k): one matrix product,
+    and the rest in its place. Quickest where n is the smaller."""
+    half_a, half_b = (-0.5 * each.square().sum(-1, keepdim=True) for each in (a, b))
+    one_a, one_b = torch.ones_like(half_a), torch.ones_like(half_b)
+    b = torch.cat((b, half_b, one_b), -1) / sigma**2
+    # Of points that are one, rounding may leave a little more than 1.
+    return (torch.cat((a, one_a, half_a), -1) @ b.T).exp_()
 
 
-def _soft_points(log_p: Tensor, moved: Tensor, y: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
-    """Soft matches (H, M, 3) and log-likelihoods (H, M) of test nodes moved (H, M, 3) onto y."""
-    assignment, likelihood = _assign(log_p, moved, y, sigma)
-    return assignment @ y, likelihood
+def _log(x: Tensor) -> Tensor:
+    return x.clamp_min(1e-300).log()
+
+
+def _sums(X: Tensor, value: Tensor, x: Tensor, y: Tensor, sigma: float) -> Tensor:
+    """(H, M, K) sums over y (N, 3) of value (M, N, K) times the closeness of y to x (M, 3), moved
+    by X (H, 4, 4)."""
+    moved = transform(X, x).transpose(0, 1)  # (M, H, 3)
+    H, N = len(X), len(y)
+    some = max(1, 2**18 // (H * N))  # nodes at a time, so that it all stays in the cache
+    result = [
+        v.mT @ _closeness(y, m.flatten(0, 1), sigma).view(N, -1, H).transpose(0, 1)
+        for v, m in zip(value.split(some), moved.split(some), strict=True)
+    ]  # (some, K, H)
+    return torch.cat(result).permute(2, 0, 1)
+
+
+def _soft_points(X: Tensor, p: Tensor, x: Tensor, y: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
+    """Soft matches (H, M, 3) and log-likelihoods (H, M) of nodes x (M, 3) moved by X (H, 4, 4) onto
+    y (N, 3), under probabilities p (M, N) of matches from descriptors alone."""
+    value = p[..., None] * torch.cat((y, torch.ones_like(y[:, :1])), -1)  # (M, N, 4)
+    total = _sums(X, value, x, y, sigma)
+    return total[..., :3] / total[..., 3:].clamp_min(1e-300), _log(total[..., 3])
+
+
+def _log_likelihood(X: Tensor, p: Tensor, x: Tensor, y: Tensor, sigma: float) -> Tensor:
+    """(H,) mean over nodes of the log-likelihoods of `_soft_points`."""
+    return _log(_sums(X, p[..., None], x, y, sigma)[..., 0]).mean(-1)
 
 
 def _sides(triangle: Tensor) -> Tensor:
@@ -136,82 +162,126 @@ def _area(sides: Tensor) -> Tensor:
     return (half * (half[..., None] - sides).prod(-1)).clamp_min(0).sqrt()
 
 
+def draw_triplets(p: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Of every object (B) `count` times three different test nodes and demonstration nodes drawn
+    from their matches p (B, M, N): indices (B, count, 3) both."""
+    B, M, N = p.shape
+
+    def below(n: int) -> Tensor:
+        return torch.randint(n, (B, count), generator=generator).to(p.device)
+
+    first, gap = below(M), 1 + below(M - 1)
+    other = 1 + below(M - 2)
+    other = other + (other >= gap)
+    rows = torch.stack((first, first + gap, first + other), -1) % M
+    # All rows of p one after the other are one distribution function from 0 to B M.
+    row = torch.arange(B)[:, None, None].to(p.device) * M + rows
+    function = p.double().cumsum(-1)
+    function = function / function[..., -1:] + torch.arange(B * M).to(p.device).view(B, M, 1)
+    u = torch.rand(B, count, 3, generator=generator, dtype=torch.float64).to(p.device)
+    columns = torch.searchsorted(function.flatten(), row + u, right=True) - row * N
+    return rows, columns.clamp(0, N - 1)
+
+
 def global_hypotheses(
-    logits: Tensor, x: Tensor, y: Tensor, config: VotingConfig, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    """Coarse motions (H, 4, 4) of unit-scaled test nodes x (M, 3) onto y (N, 3), best first.
+    p: Tensor, x: Tensor, y: Tensor, config: VotingConfig, generator: torch.Generator
+) -> list[tuple[Tensor, Tensor]]:
+    """Of every object (B) coarse motions (H, 4, 4) of unit-scaled test nodes x (B, M, 3) onto y
+    (B, N, 3), best first, and their log-likelihoods (H,); p (B, M, N) probabilities of matches.
 
     Triplets of matches drawn from the soft matching, fitted (Kabsch), scored by the likelihood of
     all nodes under descriptors and geometry, refined by expectation maximisation.
     """
-    M = len(x)
-    log_p = logits.log_softmax(-1)
-    T = config.triplets
-    rows = torch.rand(T, M, generator=generator, dtype=torch.float64).to(x).topk(3).indices
-    columns = torch.multinomial(
-        log_p[rows].exp().flatten(0, 1).double(), 1, generator=generator
-    ).reshape(T, 3)
-    X = kabsch(x[rows], y[columns])
+    B, M, _ = x.shape
+    rows, columns = draw_triplets(p, config.triplets, generator)
+    objects = torch.arange(B, device=p.device)[:, None, None]
+    source, goal = x[objects, rows], y[objects, columns]  # (B, T, 3, 3)
     # Slender triangles leave the rotation open, and a side that changed its length by more than
     # `stretch` is no match.
-    sides = [_sides(points) for points in (x[rows], y[columns])]
+    sides = [_sides(points) for points in (source, goal)]
     area = torch.minimum(*(_area(s) for s in sides))
     ratio = (sides[1] / sides[0].clamp_min(1e-6)).clamp_min(1e-6).log().abs().amax(-1)
     sound = (area > 0.03) & (ratio < math.log(config.stretch))
+    refined = min(config.refined, config.triplets)
+    scored = sound | (sound.sum(1, keepdim=True) < refined)  # the others only where they are needed
+    fitted = kabsch(source[scored], goal[scored]).split(scored.sum(1).tolist())
     # Anchor nodes only: the score needs no more, and this is the costly part.
     anchors = slice(0, min(M, 40))
-    _, likelihood = _soft_points(log_p[anchors], transform(X, x[anchors]), y, config.coarse_sigma)
-    score = torch.where(sound, likelihood.mean(-1), likelihood.mean(-1) - 1e3)
-    X = X[score.topk(min(config.refined, T)).indices]
+    best = []
+    for b, X in enumerate(fitted):
+        score = _log_likelihood(X, p[b, anchors], x[b, anchors], y[b], config.coarse_sigma)
+        score = score - 1e3 * ~sound[b, scored[b]]
+        best.append(X[score.topk(refined).indices])
+    X = torch.stack(best)  # (B, refined, 4, 4)
     for _ in range(4):
-        soft, likelihood = _soft_points(log_p, transform(X, x), y, config.coarse_sigma)
+        soft, likelihood = (
+            torch.stack(each)
+            for each in zip(
+                *(_soft_points(X[b], p[b], x[b], y[b], config.coarse_sigma) for b in range(B)),
+                strict=True,
+            )
+        )
         weight = (likelihood - likelihood.amax(-1, keepdim=True)).exp().clamp_min(1e-3).sqrt()
-        X = kabsch(x.expand(len(X), -1, -1), soft, weight)
-    _, likelihood = _soft_points(log_p, transform(X, x), y, config.coarse_sigma)
-    score = likelihood.mean(-1)
-    chosen: list[int] = []
-    for k in score.argsort(descending=True).tolist():
-        if len(chosen) == config.hypotheses or score[k] < score.max() - config.margin:
-            break
-        if all(geodesic_angle(X[k, :3, :3], X[c, :3, :3]) > config.distinct for c in chosen):
-            chosen.append(k)
-    return X[chosen], score[chosen]
+        X = kabsch(x[:, None].expand(soft.shape), soft, weight)
+    score = torch.stack(
+        [_log_likelihood(X[b], p[b], x[b], y[b], config.coarse_sigma) for b in range(B)]
+    )
+    flat = X[..., :3, :3].flatten(2)
+    same = (flat @ flat.mT >= 1 + 2 * math.cos(config.distinct)).tolist()  # by the trace
+    result = []
+    for b in range(B):
+        chosen: list[int] = []
+        close = (score[b] >= score[b].max() - config.margin).tolist()
+        for k in score[b].argsort(descending=True).tolist():
+            if len(chosen) == config.hypotheses or not close[k]:
+                break
+            if not any(same[b][k][c] for c in chosen):
+                chosen.append(k)
+        result.append((X[b, chosen], score[b, chosen]))
+    return result
 
 
-def match_object(
+def match_objects(
     logits: Tensor,
     test: Tensor,
     demonstration: Tensor,
     config: VotingConfig,
     generator: torch.Generator,
-) -> Match:
-    """Matches test nodes (M, 3) to demonstration nodes (N, 3) given logits (M, N); see `Match`."""
-    x, _, _ = _unit(test)
-    y, centre, scale = _unit(demonstration)
-    X, score = global_hypotheses(logits, x, y, config, generator)
-    assignment, _ = _assign(logits.log_softmax(-1), transform(X, x), y, config.match_sigma)
-    soft = (assignment @ y) * scale + centre  # (H, M, 3) in the demonstration's frame
-    H, M = soft.shape[:2]
+) -> list[Match]:
+    """Matches test nodes (B, M, 3) to demonstration nodes (B, N, 3) given logits (B, M, N), each of
+    B pairs of objects on its own; see `Match`."""
+    x, y = _unit(test), _unit(demonstration)
+    p = logits.softmax(-1)
+    hypotheses = global_hypotheses(p, x, y, config, generator)
+    counts = [len(score) for _, score in hypotheses]
+    of = torch.arange(len(p), device=p.device).repeat_interleave(torch.tensor(counts).to(p.device))
+    # From here on all hypotheses of all objects (H) in one batch.
+    R = torch.cat([X[:, :3, :3] for X, _ in hypotheses])
+    assignment = torch.cat(
+        [
+            p[b]
+            * _closeness(transform(X, x[b]).flatten(0, 1), y[b], config.match_sigma).view(
+                len(X), *p[b].shape
+            )
+            for b, (X, _) in enumerate(hypotheses)
+        ]
+    )
+    assignment = assignment / assignment.sum(-1, keepdim=True).clamp_min(1e-300)
+    soft = assignment @ demonstration[of]  # (H, M, 3) in the demonstration's frame
+    M = test.shape[1]
     parts = min(config.parts, M)
     count = max(6, round(config.neighbourhood * M))
-    distance, near = torch.cdist(test[:parts], test).topk(count, largest=False)
-    weight = torch.exp(-0.5 * (distance / distance[:, -1:]).square() * 2)  # (parts, count)
-    source = test[near].expand(H, -1, -1, -1)
-    goal = soft[:, near]
-    fit = kabsch(source, goal, weight.expand(H, -1, -1))
+    distance, near = torch.cdist(test[:, :parts], test).topk(count, largest=False)
+    weight = torch.exp(-0.5 * (distance / distance[..., -1:]).square() * 2)  # (B, parts, count)
+    source = test[torch.arange(len(test))[:, None, None], near][of]  # (H, parts, count, 3)
+    goal = soft[torch.arange(len(soft))[:, None, None], near[of]]
+    weight = weight[of]
+    fit = kabsch(source, goal, weight)
     error = (transform(fit, source) - goal).square().sum(-1)
     residual = ((weight * error).sum(-1) / weight.sum(-1)).sqrt()
-    place = transform(fit, test[:parts, None])[..., 0, :]
-    return Match(score, fit, place, residual, X[:, :3, :3], assignment)
-
-
-def _pose_distance2(Ra: Tensor, pa: Tensor, Rb: Tensor, pb: Tensor, config: VotingConfig) -> Tensor:
-    """Squared distance of poses; rotations (..., 3, 3) by the chord, places (..., 3) at the
-    part."""
-    chord2 = (3 - (Ra * Rb).sum((-1, -2))).clamp_min(0)  # = 4 sin^2(angle / 2), about angle^2
-    return (
-        chord2 / config.sigma_rotation**2 + (pa - pb).square().sum(-1) / config.sigma_translation**2
-    )
+    place = transform(fit, test[of, :parts, None])[..., 0, :]
+    split = (each.split(counts) for each in (fit, place, residual, R, assignment))
+    return [Match(score, *each) for (_, score), *each in zip(hypotheses, *split, strict=True)]
 
 
 def _combine(A: list[Match], B: list[Match], config: VotingConfig) -> tuple[Tensor, Tensor, Tensor]:
@@ -310,33 +380,40 @@ def modes(votes: Votes) -> tuple[Tensor, Tensor]:
     """Clusters weighted poses: kernel density, mean shift from the densest, non-maximum
     suppression. See `vote`."""
     X, log_weight, centre, config = votes.X, votes.log_weight, votes.centre, votes.config
-    R = X[:, :3, :3]
-    place = transform(X, centre[None].expand(len(X), 1, 3))[:, 0]
+    # Poses as points whose squared distances are those of `_log_density`: |R - S|^2 = 2 (3 - R.S).
+    at = torch.cat(
+        (
+            X[:, :3, :3].flatten(1) / (math.sqrt(2) * config.sigma_rotation),
+            transform(X, centre[None])[:, 0] / config.sigma_translation,
+        ),
+        -1,
+    )  # (n, 12)
     weight = (log_weight - log_weight.max()).exp()
+    density = torch.cat([_closeness(some, at, 1.0) @ weight for some in at.split(128)])
     alive = torch.ones(len(X), dtype=torch.bool)
-    found: list[tuple[Tensor, Tensor]] = []
+    found: list[Tensor] = []
     energies: list[float] = []
-    chord2 = (3 - R.flatten(1) @ R.flatten(1).T).clamp_min(0) / config.sigma_rotation**2
-    distance2 = chord2 + (torch.cdist(place, place) / config.sigma_translation).square()
-    density = (-0.5 * distance2).exp() @ weight
     while len(found) < config.modes and alive.any():
         seed = int(torch.where(alive, density, torch.zeros_like(density)).argmax())
-        rotation, p = R[seed], place[seed]
+        mode = at[seed]
         for _ in range(3):
-            near = (-0.5 * _pose_distance2(R, place, rotation, p, config)).exp() * weight
-            near = near / near.sum()
-            rotation = nearest_rotation((near[:, None, None] * R).sum(0))
-            p = (near[:, None] * place).sum(0)
-        d2 = _pose_distance2(R, place, rotation, p, config)
-        alive &= (d2 > 9.0) & (distance2[seed] > 4.0)
-        if any(_pose_distance2(S, q, rotation, p, config) < 9.0 for S, q in found):
+            near = (-0.5 * (at - mode).square().sum(-1)).exp() * weight
+            mode = near @ at / near.sum()
+            rotation = nearest_rotation(mode[:9].view(3, 3))
+            mode[:9] = rotation.flatten() / (math.sqrt(2) * config.sigma_rotation)
+        d2 = (at - mode).square().sum(-1)
+        alive &= (d2 > 9.0) & ((at - at[seed]).square().sum(-1) > 4.0)
+        if any((other - mode).square().sum() < 9.0 for other in found):
             continue  # the shift led to a mode that is there already
-        found.append((rotation, p))
+        found.append(mode)
         mass = float(((-0.5 * d2).exp() * weight).sum())
         energies.append(-math.log(mass + 1e-30) - float(log_weight.max()))
         if energies[-1] > energies[0] + 6:
             break
-    poses = torch.stack([rigid(rotation, p - rotation @ centre) for rotation, p in found])
+    best = torch.stack(found)
+    rotation = best[:, :9].view(-1, 3, 3) * (math.sqrt(2) * config.sigma_rotation)
+    p = best[:, 9:] * config.sigma_translation
+    poses = rigid(rotation, p - (rotation @ centre[:, None])[..., 0])
     energy = torch.tensor(energies, dtype=poses.dtype)
     order = energy.argsort()
     return poses[order], energy[order]

@@ -1,5 +1,7 @@
 """The descriptor network: invariances by axiom, over random clouds."""
 
+import copy
+
 import pytest
 import torch
 
@@ -30,6 +32,17 @@ def test_invariant_under_rigid_motions(net: DescriptorNet, cloud) -> None:
     R = random_rotations(4, generator=torch.Generator().manual_seed(2))
     moved = points @ R.transpose(1, 2) + torch.randn(4, 1, 3, dtype=torch.float64)
     torch.testing.assert_close(net(moved, nodes), net(points, nodes), atol=1e-6, rtol=0)
+
+
+def test_mixed_precision_is_the_same_and_invariant(net: DescriptorNet, cloud) -> None:
+    points, nodes = cloud
+    mixed = copy.deepcopy(net).mixed_precision()
+    found = mixed(points, nodes)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found.double(), net(points, nodes), atol=1e-5, rtol=0)
+    R = random_rotations(4, generator=torch.Generator().manual_seed(2))
+    moved = points @ R.transpose(1, 2) + torch.randn(4, 1, 3, dtype=torch.float64)
+    torch.testing.assert_close(mixed(moved, nodes), found, atol=2e-6, rtol=0)
 
 
 def test_follows_a_permutation_of_points_and_nodes(net: DescriptorNet, cloud) -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from iga_drake.aligners.iga.voting import VotingConfig, match_object, vote
+from iga_drake.aligners.iga.voting import VotingConfig, draw_triplets, match_objects, vote
 from iga_drake.dataset.samples import make_sample
 from iga_drake.geometry.clouds import furthest_point_sampling
 from iga_drake.geometry.se3 import geodesic_angle, inverse, random_rotations, rigid, transform
@@ -19,13 +19,51 @@ def _solve(A: list[Tensor], B: list[Tensor], logits) -> tuple[Tensor, Tensor]:
     """The last cloud of A and B is the test; logits(role, demonstration) of the test's nodes."""
     generator = torch.Generator().manual_seed(0)
     matches = [
-        [
-            match_object(logits(role, d), clouds[-1], clouds[d], CONFIG, generator)
-            for d in range(len(clouds) - 1)
-        ]
+        match_objects(
+            torch.stack([logits(role, d) for d in range(len(clouds) - 1)]),
+            clouds[-1].expand(len(clouds) - 1, -1, -1),
+            torch.stack(clouds[:-1]),
+            CONFIG,
+            generator,
+        )
         for role, clouds in enumerate((A, B))
     ]
     return vote(matches[0], matches[1], A[-1], CONFIG)
+
+
+def test_triplets_are_three_different_nodes_and_follow_the_matches() -> None:
+    p = torch.tensor([[0.7, 0.3, 0.0], [0.0, 0.0, 1.0], [0.1, 0.5, 0.4], [0.25, 0.5, 0.25]])
+    p = torch.stack((p, p.flip(1))).double()
+    count = 20000
+    rows, columns = draw_triplets(p, count, torch.Generator().manual_seed(0))
+    three_sigma = 3 * (0.25 / count) ** 0.5
+    assert all(len({*triplet}) == 3 for triplet in rows.flatten(0, 1).tolist())
+    for b in range(2):
+        ordered = rows[b, :, 0] * 16 + rows[b, :, 1] * 4 + rows[b, :, 2]
+        share = ordered.bincount() / count  # of the 24 ordered triplets, all as likely
+        assert ((share == 0) | ((share - 1 / 24).abs() < three_sigma)).all()
+        for k in range(3):
+            for i in range(4):
+                drawn = columns[b, :, k][rows[b, :, k] == i]
+                share = drawn.bincount(minlength=3) / len(drawn)
+                torch.testing.assert_close(share.double(), p[b, i], atol=2 * three_sigma, rtol=0)
+                assert (share[p[b, i] == 0] == 0).all()
+
+
+def test_objects_of_a_batch_are_matched_each_on_its_own() -> None:
+    """Against the motions that made them."""
+    test = torch.randn(3, 40, 3, generator=torch.Generator().manual_seed(1)).double() * 0.05
+    X = torch.stack([_motion(k) for k in range(3)])
+    order = torch.stack([torch.randperm(40) for _ in range(3)])
+    moved = transform(X, torch.stack([test[b, order[b]] for b in range(3)]))
+    logits = 20.0 * (order[:, None] == torch.arange(40)[:, None]).double()
+    found = match_objects(logits, test, moved, CONFIG, torch.Generator().manual_seed(0))
+    for b, match in enumerate(found):
+        torch.testing.assert_close(match.R_DT[0], X[b, :3, :3], atol=1e-3, rtol=0)
+        fit = X[b].expand_as(match.X_DT[0])
+        torch.testing.assert_close(match.X_DT[0], fit, atol=1e-3, rtol=0)
+        assert match.assignment[0].argmax(-1).tolist() == order[b].argsort().tolist()
+        assert float(match.residual[0].max()) < 1e-3
 
 
 def _motion(seed: int) -> Tensor:
