@@ -15,7 +15,7 @@ from typing import TypeVar
 import torch
 
 from iga_drake.errors import IgaDrakeError
-from iga_drake.training import dif_net, encoder
+from iga_drake.training import dif_net, encoder, paper_cli
 from iga_drake.training.descriptor import DescriptorSettings, train_descriptor
 from iga_drake.training.energy import EnergySettings, train_energy
 from iga_drake.training.ranks import launched, process_group
@@ -43,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_descriptor(networks.add_parser("descriptor", help="dense descriptors of the iga aligner"))
     _add_energy(networks.add_parser("energy", help="energy of the iga aligner: ranks poses"))
     encoder.add_arguments(networks.add_parser("encoder", help="local encoder, by occupancy"))
+    paper_cli.add_arguments(networks.add_parser("paper", help="the paper's networks and variants"))
     dif_net.add_arguments(networks.add_parser("dif-net", help="deformed implicit field of chairs"))
 
 
@@ -148,6 +149,8 @@ def main(arguments: argparse.Namespace) -> int:
         return ALONE[arguments.network].main(arguments)
     torch.set_num_threads(arguments.threads)
     torch.set_flush_denormal(True)
+    if arguments.network == "paper":
+        return paper_cli.main(arguments)
     if arguments.network == "energy":
         return _train_energy(arguments)
     settings = _settings(arguments, DescriptorSettings.of(arguments.out))

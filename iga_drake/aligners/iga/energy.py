@@ -282,7 +282,8 @@ class Energy:
 
     def refine(self, X: Tensor, steps: int = 4) -> Tensor:
         """Poses (n, 4, 4) moved down the energy: each step takes the mean of the proposals,
-        weighted by their part in the pose's likelihood (mean shift, Comaniciu & Meer 2002)."""
+        weighted by their part in the pose's likelihood (expectation maximisation, or mean shift:
+        Comaniciu & Meer 2002). No step raises the energy."""
         p = self.proposals
         K, D, C = self.log_likely.shape
         for _ in range(steps):
@@ -293,13 +294,18 @@ class Energy:
             share = (terms - of_demonstration[..., None]).exp()
             share = share * self._pairs(terms).softmax(-1)[:, :, None, None]
             turn, shift = ((share * self.precision[..., k]).reshape(len(X), -1) for k in range(2))
-            R = nearest_rotation((turn @ p.R.reshape(-1, 9)).reshape(-1, 3, 3))
-            # The translation that puts the parts best, given the rotation.
+            # The pose of the least sum of weighted squared distances: Kabsch's fit of the parts to
+            # their places, to whose covariance the proposed rotations add.
             mass = shift.sum(-1, keepdim=True).clamp_min(1e-30)
-            goal = shift @ p.place.reshape(-1, 3) / mass
-            weight = shift.reshape(len(X), K, D * C).sum(-1) / mass
-            t = goal - ((R @ (weight @ p.part)[..., None])[..., 0])
-            X = rigid(R, t)
+            places = p.place.reshape(-1, 3)
+            of_part = shift.reshape(len(X), K, D * C).sum(-1)  # (n, K)
+            goal, source = shift @ places / mass, of_part @ p.part / mass
+            outer = (p.place[..., :, None] * p.part[:, None, None, None]).reshape(-1, 9)
+            covariance = (shift @ outer).reshape(-1, 3, 3)
+            covariance = covariance - mass[..., None] * goal[:, :, None] * source[:, None]
+            rotations = (turn @ p.R.reshape(-1, 9)).reshape(-1, 3, 3)
+            R = nearest_rotation(rotations / 2 + covariance)
+            X = rigid(R, goal - (R @ source[..., None])[..., 0])
         return X
 
 
