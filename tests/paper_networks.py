@@ -1,12 +1,18 @@
 """Small random graph networks and problems. Shared by tests."""
 
+from pathlib import Path
+
 import torch
 
+from iga_drake.aligners.iga.local_encoder import EncoderConfig
 from iga_drake.aligners.iga_paper.graph import GraphConfig, GraphNetwork, Nodes
 from iga_drake.aligners.iga_paper.langevin import haar_rotations
+from iga_drake.aligners.iga_paper.model import OUTPUTS, PaperModel, kind_of
+from iga_drake.checkpoint import save_checkpoint
 
 SMALL = GraphConfig(heads=2, head_width=8, convolutions=3, hidden=16, frequencies=3, nodes=4)
 CHANNELS = 5
+ENCODER = EncoderConfig(channels=CHANNELS, layers=2, point_layers=1, scalars=4)
 
 
 def network(config: GraphConfig = SMALL, *, outputs: int = 1, seed: int = 0) -> GraphNetwork:
@@ -39,3 +45,20 @@ def double(nested):
         return nested.double()
     items = [double(item) for item in nested]
     return type(nested)(*items) if hasattr(nested, "_fields") else tuple(items)
+
+
+def model(part: str, *, seed: int = 0) -> PaperModel:
+    """Untrained, for evaluation."""
+    torch.manual_seed(seed)
+    return PaperModel(part, SMALL, ENCODER).eval().requires_grad_(False)
+
+
+def untrained(folder: Path) -> Path:
+    """The folder with checkpoints of all parts."""
+    for part in OUTPUTS:
+        net = model(part)
+        path = folder / f"{kind_of(part)}.safetensors"
+        card = {"samples_seen": 0, "seconds": 0.0, "training": {"accumulate": 1, "batch": 1}}
+        card = net.description() | card
+        save_checkpoint(path, net.state_dict(), kind=kind_of(part), card=card)
+    return folder

@@ -18,7 +18,31 @@ def _iga(**options: Any) -> Aligner:
     return IgaAligner(**options)
 
 
-ALIGNERS: dict[str, Callable[..., Aligner]] = {"icp": _icp, "iga": _iga}
+def _iga_paper(**options: Any) -> Aligner:
+    from iga_drake.aligners.iga_paper.aligner import IgaPaperAligner
+
+    return IgaPaperAligner(**options)
+
+
+def _dirreg(**options: Any) -> Aligner:
+    from iga_drake.aligners.iga_paper.variants import DirRegAligner
+
+    return DirRegAligner(**options)
+
+
+def _dfm(**options: Any) -> Aligner:
+    from iga_drake.aligners.iga_paper.variants import DfmAligner
+
+    return DfmAligner(**options)
+
+
+ALIGNERS: dict[str, Callable[..., Aligner]] = {
+    "icp": _icp,
+    "iga": _iga,
+    "iga-paper": _iga_paper,
+    "dirreg": _dirreg,
+    "dfm": _dfm,
+}
 
 
 def make_aligner(name: str, **options: Any) -> Aligner:

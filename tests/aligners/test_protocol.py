@@ -1,11 +1,15 @@
 """Clouds and estimates are checked at the boundary."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from paper_networks import untrained
 
 from iga_drake.aligners.protocol import AlignerError, Alignment, PoseEstimate, check_cloud
 from iga_drake.aligners.registry import ALIGNERS, make_aligner
 
+PAPER = ("iga-paper", "dirreg", "dfm")
 CLOUD = np.random.default_rng(0).normal(size=(64, 3)) * 0.05
 
 
@@ -35,13 +39,14 @@ def test_an_estimate_needs_poses_of_one_length() -> None:
 
 
 def test_an_unknown_aligner_lists_the_known_ones() -> None:
-    with pytest.raises(AlignerError, match="icp, iga"):
+    with pytest.raises(AlignerError, match="dfm, dirreg, icp, iga, iga-paper"):
         make_aligner("magic")
 
 
 @pytest.mark.parametrize("name", sorted(ALIGNERS))
-def test_every_aligner_refuses_bad_input(name: str) -> None:
-    aligner = make_aligner(name)
+def test_every_aligner_refuses_bad_input(name: str, tmp_path: Path) -> None:
+    options = {"weights": untrained(tmp_path)} if name in PAPER else {}
+    aligner = make_aligner(name, **options)
     assert aligner.name == name
     with pytest.raises(AlignerError, match="context is empty"):
         aligner.align((), CLOUD, CLOUD)

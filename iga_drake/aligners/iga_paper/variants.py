@@ -1,0 +1,125 @@
+"""The paper's variants of its own method on the same graph: DirReg, which regresses the transform,
+and DFM, which regresses the distance to the right pose and descends it."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from iga_drake.aligners.iga_paper.aligner import Asked, estimate, found_model
+from iga_drake.aligners.iga_paper.langevin import LangevinConfig, haar_rotations
+from iga_drake.aligners.iga_paper.model import PaperModel
+from iga_drake.aligners.iga_paper.search import correction_of, search_distance
+from iga_drake.aligners.protocol import Alignment, PoseEstimate
+
+
+@dataclass(frozen=True)
+class DirRegConfig:
+    """How often the transform is regressed, each time from where the last one led."""
+
+    points: int = 256  # of a cloud
+    iterations: int = 1
+
+
+class DirRegAligner:
+    """`Aligner` by direct regression from a random start. One mode, no energy: 0."""
+
+    name = "dirreg"
+
+    def __init__(
+        self,
+        model: PaperModel | None = None,
+        *,
+        weights: Path | str | None = None,
+        config: DirRegConfig | None = None,
+    ):
+        """Takes a model, or reads the file (or folder) `weights`; default: what is landed.
+
+        Raises `AlignerError` where there is none, `CheckpointError` for a foreign file.
+        """
+        self.model = model or found_model("dirreg", weights, self.name)
+        self.config = config or DirRegConfig()
+
+    @torch.no_grad()
+    def align(
+        self,
+        context: tuple[Alignment, ...],
+        grasped: np.ndarray,
+        target: np.ndarray,
+        *,
+        seed: int = 0,
+    ) -> PoseEstimate:
+        """See `Aligner.align`."""
+        asked = Asked.of(
+            self.model, context, grasped, target,
+            points=self.config.points, seed=seed, name=self.name,
+        )  # fmt: skip
+        known = asked.problem.context(self.model.graph)
+        R = haar_rotations(1, 1, generator=torch.Generator().manual_seed(seed))
+        t = asked.problem.offset()[:, None]
+        for _ in range(self.config.iterations):
+            R, t = correction_of(self.model.graph, known, R, t)
+        return estimate(asked, R[0], t[0], torch.zeros(1), 1)
+
+
+def descent() -> LangevinConfig:
+    """Of distances, whose slopes are 1 per rad and 10 per metre: up to 0.1 rad and 1 cm a step,
+    without noise."""
+    return LangevinConfig(rotation_rate=0.2, translation_rate=2e-3, noise=0.0)
+
+
+@dataclass(frozen=True)
+class DfmConfig:
+    """How distances are descended."""
+
+    points: int = 256  # of a cloud
+    langevin: LangevinConfig = field(default_factory=descent)
+    spread: float = 0.3  # m, half the width of the cube where translations start
+    modes: int = 5  # at most so many poses are given
+
+
+class DfmAligner:
+    """`Aligner` by descent of a learned distance; the energies are the distances at the end."""
+
+    name = "dfm"
+
+    def __init__(
+        self,
+        model: PaperModel | None = None,
+        *,
+        weights: Path | str | None = None,
+        config: DfmConfig | None = None,
+    ):
+        """Takes a model, or reads the file (or folder) `weights`; default: what is landed.
+
+        Raises `AlignerError` where there is none, `CheckpointError` for a foreign file.
+        """
+        self.model = model or found_model("dfm", weights, self.name)
+        self.config = config or DfmConfig()
+
+    @torch.no_grad()
+    def align(
+        self,
+        context: tuple[Alignment, ...],
+        grasped: np.ndarray,
+        target: np.ndarray,
+        *,
+        seed: int = 0,
+    ) -> PoseEstimate:
+        """See `Aligner.align`."""
+        config = self.config
+        asked = Asked.of(
+            self.model, context, grasped, target,
+            points=config.points, seed=seed, name=self.name,
+        )  # fmt: skip
+        known = asked.problem.context(self.model.graph)
+        R, t, distance = search_distance(
+            self.model.graph,
+            known,
+            asked.problem.offset(),
+            config.langevin,
+            torch.Generator().manual_seed(seed),
+            spread=config.spread,
+        )
+        return estimate(asked, R[0], t[0], distance[0], config.modes)
