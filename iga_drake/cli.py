@@ -228,6 +228,7 @@ EVALUATIONS = {
         "add_evaluate_deformations",
         "evaluate_deformations",
     ),
+    "foreign": ("iga_drake.evaluation.foreign", "add_arguments", "main"),
     "diagnosis": (
         "iga_drake.evaluation.diagnosis",
         "add_evaluate_diagnosis",
@@ -235,6 +236,17 @@ EVALUATIONS = {
     ),
     "scaling": ("iga_drake.evaluation.scaling", "add_evaluate_scaling", "evaluate_scaling"),
     "diversity": ("iga_drake.evaluation.scaling", "add_evaluate_diversity", "evaluate_diversity"),
+    "compare": ("iga_drake.evaluation.compare", "add_compare", "evaluate_compare"),
+    "stabilisers": (
+        "iga_drake.evaluation.stabilisers",
+        "add_stabilisers",
+        "evaluate_stabilisers",
+    ),
+    "training-log": (
+        "iga_drake.evaluation.training_log",
+        "add_training_log",
+        "evaluate_training_log",
+    ),
 }
 
 

@@ -58,7 +58,8 @@ def untrained(folder: Path) -> Path:
     for part in OUTPUTS:
         net = model(part)
         path = folder / f"{kind_of(part)}.safetensors"
-        card = {"samples_seen": 0, "seconds": 0.0, "training": {"accumulate": 1, "batch": 1}}
-        card = net.description() | card
+        card: dict = net.description() | {"samples_seen": 6, "seconds": 30.0, "step": 3}
+        card["samples"] = {"cloud_points": 64, "surface_points": 400, "least_seen": 8}
+        card["training"] = {"candidates": 4, "penalty_poses": 2}
         save_checkpoint(path, net.state_dict(), kind=kind_of(part), card=card)
     return folder

@@ -152,10 +152,11 @@ def _turned(nodes: Nodes, turns: Tensor) -> Nodes:
     return moved(nodes, rigid(turns, torch.zeros_like(turns[..., 0]))[:, None])
 
 
-def _nodes_of(
+def nodes_of(
     batch: Batch, model: PaperModel, frames: str, device: torch.device | str
 ) -> tuple[Nodes, Tensor]:
-    """Nodes (S, 2, N, K), and the rotations (S, N, 3, 3) of their alignments from W."""
+    """Nodes (S, 2, N, K) of samples, and the rotations (S, N, 3, 3) of their alignments from W:
+    none, or for common frames those of `common_turns`."""
     points = batch["points"].to(device)
     nodes = encode(model.encoder, points, model.graph.config.nodes)
     if frames == "own":
@@ -197,7 +198,7 @@ class NodeStream:
     def __next__(self) -> Nodes:
         config = self._config
         if not config.subset:
-            return _nodes_of(next(self._batches), self._model, config.frames, self._device)[0]
+            return nodes_of(next(self._batches), self._model, config.frames, self._device)[0]
         some = [self._of_subset((self._next + k) % config.subset) for k in range(config.batch)]
         self._next += self._stride
         return Nodes(*(torch.stack(parts) for parts in zip(*some, strict=True)))
@@ -205,7 +206,7 @@ class NodeStream:
     def _of_subset(self, index: int) -> Nodes:
         if index not in self._kept:
             batch = collate([make_sample("train", index, self._samples)])
-            nodes, _ = _nodes_of(batch, self._model, self._config.frames, self._device)
+            nodes, _ = nodes_of(batch, self._model, self._config.frames, self._device)
             self._kept[index] = Nodes(*(part[0] for part in nodes))
         return self._kept[index]
 
@@ -378,7 +379,7 @@ def part_errors(
     rows = []
     for index in range(count):
         sample = make_sample(split, index, samples)
-        nodes, turns = _nodes_of(collate([sample]), model, config.frames, device)
+        nodes, turns = nodes_of(collate([sample]), model, config.frames, device)
         asked, turn = problem(nodes), turns[0, -1].double().cpu().numpy()
         generator = torch.Generator(device).manual_seed(index)
         context, start = asked.context(model.graph), asked.offset()

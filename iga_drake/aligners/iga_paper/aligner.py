@@ -36,9 +36,9 @@ def landed(part: str) -> Path:
     return models_dir() / "weights" / f"{kind_of(part)}.safetensors"
 
 
-def found_model(part: str, path: Path | str | None, name: str) -> PaperModel:
-    """A part's model for the aligner `name`: of a checkpoint, of a folder with such, or the landed
-    one. Raises `AlignerError` where there is none, `CheckpointError` where it is a foreign one."""
+def found_path(part: str, path: Path | str | None, name: str) -> Path:
+    """A part's checkpoint for the aligner `name`: a file, in a folder of such, or the landed one.
+    Raises `AlignerError` where there is none."""
     chosen = Path(path) if path else landed(part)
     if chosen.is_dir():
         chosen = chosen / f"{kind_of(part)}.safetensors"
@@ -47,7 +47,13 @@ def found_model(part: str, path: Path | str | None, name: str) -> PaperModel:
             f"{name}: no weights of part '{part}' at {chosen}: train them with `iga train paper "
             f"--part {part} --out DIR` and give the file or its folder"
         )
-    return load_model(chosen, part)[0]
+    return chosen
+
+
+def found_model(part: str, path: Path | str | None, name: str) -> PaperModel:
+    """The model of `found_path`. Raises `AlignerError`, and `CheckpointError` where it is a foreign
+    one."""
+    return load_model(found_path(part, path, name), part)[0]
 
 
 def _drawn(cloud: np.ndarray, count: int, seed: int) -> Tensor:
