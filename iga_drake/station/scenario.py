@@ -206,6 +206,9 @@ class Aligner:
     name: str = "iga"
     # What that aligner lets one choose, as numbers or text; it refuses names it doesn't know.
     options: dict[str, float | str] = field(default_factory=dict)
+    # Probability, in [0, 1], that the demonstrations show such objects at all, below which the
+    # policy refuses; 0 refuses nothing. Aligners that can't tell are not asked.
+    minimum_familiarity: float = 0.0
 
 
 @dataclass
@@ -453,6 +456,8 @@ def _check_values(s: Scenario) -> None:
     need(ordered, "fusion.crop_lower", f.crop_lower, f"below crop_upper = {f.crop_upper}")
     positive(s.visualization, "visualization", "publish_period")
     positive(s.task, "task", "time_limit")
+    least = s.aligner.minimum_familiarity
+    need(0 <= least <= 1, "aligner.minimum_familiarity", least, "0..1")
     positive(s.control, "control", "linear_speed", "angular_speed", "joint_speed_scale", "period")
     scale = s.control.joint_speed_scale
     need(scale <= 1, "control.joint_speed_scale", scale, "0..1")

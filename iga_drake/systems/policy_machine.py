@@ -57,6 +57,8 @@ class PolicyConfig:
     execute_limit: float = 60.0
     # Limit (s) of one inference, wall-clock time.
     infer_limit: float = 60.0
+    # Least `PoseEstimate.familiarity`, in [0, 1]: below it the policy refuses. 0 refuses nothing.
+    minimum_familiarity: float = 0.0
     # Seed given to the aligner.
     seed: int = 0
 
@@ -262,6 +264,14 @@ class PolicyMachine:
             return self._refuse(memory, now, reason, "time")
         if not (np.isfinite(estimate.poses).all() and np.isfinite(estimate.energies).all()):
             reason = f"aligner {self._aligner.name}: poses or energies are not finite"
+            return self._refuse(memory, now, reason, "alignment")
+        familiarity, least = estimate.familiarity, self.config.minimum_familiarity
+        if familiarity is not None and familiarity < least:
+            reason = (
+                f"aligner {self._aligner.name}: these objects look like none of the demonstrations "
+                f"(familiarity {familiarity:.2f}, {least:g} is asked for): demonstrate the task "
+                "with such objects, or ask for less"
+            )
             return self._refuse(memory, now, reason, "alignment")
         near = inputs.position()
         try:

@@ -123,6 +123,7 @@ def build_episode_diagram(
                     present_limit=limits.present,
                     infer_limit=limits.infer,
                     execute_limit=limits.execute,
+                    minimum_familiarity=scenario.aligner.minimum_familiarity,
                     seed=seed + scenario.seeds.aligner,
                 ),
             )

@@ -33,6 +33,7 @@ class FakeAligner:
     name: str = "fake"
     poses: tuple[RigidTransform, ...] = (X_GOAL,)
     error: Exception | None = None
+    familiarity: float | None = None
     calls: list = field(default_factory=list)
 
     def align(self, context, grasped, target, *, seed=0):
@@ -41,7 +42,9 @@ class FakeAligner:
             raise self.error
         matrices = np.stack([X.GetAsMatrix4() for X in self.poses])
         count = len(matrices)
-        return PoseEstimate(matrices, np.arange(count, dtype=float), np.full(count, 1 / count))
+        return PoseEstimate(
+            matrices, np.arange(count, dtype=float), np.full(count, 1 / count), self.familiarity
+        )
 
 
 @dataclass

@@ -138,6 +138,17 @@ def test_poses_that_are_not_finite_are_refused():
     assert (memory.status.phase, memory.status.cause) == (Phase.REFUSED, "alignment")
 
 
+def test_objects_that_look_like_none_of_the_demonstrations_are_refused_where_asked():
+    for familiarity, least, refused in ((0.2, 0.0, False), (0.2, 0.5, True), (None, 0.5, False)):
+        aligner = FakeAligner(familiarity=familiarity)
+        machine = make_machine(aligner=aligner, minimum_familiarity=least)
+        memory, targets = run(machine, FakeInputs())
+        assert (memory.status.phase == Phase.REFUSED) == refused
+        if refused:
+            assert memory.status.cause == "alignment" and list(targets) == [0]
+            assert "familiarity 0.20, 0.5 is asked for" in memory.status.reason
+
+
 def test_unreachable_poses_are_refused():
     memory, targets = run(make_machine(solve=lambda X_WE, near: None), FakeInputs())
     assert (memory.status.phase, memory.status.cause) == (Phase.REFUSED, "IK")

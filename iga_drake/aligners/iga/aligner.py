@@ -186,12 +186,14 @@ class IgaAligner:
         voted, voted_at = X, time.perf_counter()
         energy: Callable[[Tensor], Tensor] = votes.energy
         pair_weights: Callable[[Tensor], Tensor] = votes.pair_weights
+        familiarity = None
         if self._energy is not None:
             prepared = self._energy(
                 pair_proposals(A, B, test[0], test[1], self._energy.config, self.voting)
             )
             X, energies = minimise(prepared, also=voted, config=self.search)
             energy, pair_weights = prepared, prepared.pair_weights
+            familiarity = float(self._energy.familiarity(prepared, X[0]))
         ranked = time.perf_counter()
         probability = (-(energies - energies.min())).softmax(0).numpy()
         keep = probability >= self.config.minimum_probability * probability.max()
@@ -210,6 +212,7 @@ class IgaAligner:
                 as_given(X).numpy()[keep],
                 energies.numpy()[keep],
                 probability[keep] / probability[keep].sum(),
+                familiarity,
             ),
             nodes=goal,
             centres=torch.stack((centre_A, centre_B)),

@@ -1,0 +1,116 @@
+"""`iga evaluate foreign`: how well an aligner tells objects that its demonstrations never showed.
+
+Every sample of a set is asked twice: as it is, and with demonstrations of other objects (for both,
+the grasped or the target object in turn; never of the same family). A caller refuses below a
+familiarity of its choice: the table gives both kinds of error for some.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from iga_drake.aligners.iga.aligner import IgaAligner
+from iga_drake.aligners.protocol import Aligner
+from iga_drake.aligners.query import Query
+from iga_drake.dataset.alignment_error import CONFIG, random_pose
+from iga_drake.dataset.foreign import FOREIGN_KINDS, foreign_points, foreign_sample
+from iga_drake.dataset.samples import make_sample
+from iga_drake.dataset.splits import sample_set
+from iga_drake.errors import IgaDrakeError
+
+THRESHOLDS = (0.1, 0.3, 0.5, 0.7, 0.9)
+DEFAULT_SETS = ("unseen_instances", "unseen_categories")
+
+
+@dataclass(frozen=True)
+class Familiarity:
+    """Of the samples of a set."""
+
+    split: str
+    own: tuple[float, ...]
+    foreign: tuple[float, ...]  # in turn of FOREIGN_KINDS
+
+    def refused(self, threshold: float) -> float:
+        """Share of the samples with their own demonstrations below a threshold."""
+        return float((np.array(self.own) < threshold).mean())
+
+    def accepted(self, threshold: float, kind: int | None = None) -> float:
+        """Share of the samples with foreign ones at or above it; of all or of one kind."""
+        values = np.array(
+            self.foreign if kind is None else self.foreign[kind :: len(FOREIGN_KINDS)]
+        )
+        return float((values >= threshold).mean()) if len(values) else float("nan")
+
+    def area(self) -> float:
+        """Under the curve of the receiver's operating characteristic: how often an own context
+        looks more familiar than a foreign one (Mann & Whitney 1947)."""
+        difference = np.subtract.outer(np.array(self.own), np.array(self.foreign))
+        return float(((difference > 0) + 0.5 * (difference == 0)).mean())
+
+    def table(self) -> str:
+        """Text of many lines."""
+        kinds = "".join(f"{name:>9}" for name in FOREIGN_KINDS)
+        lines = [
+            f"{self.split}, {len(self.own)} samples; own contexts look more familiar than foreign "
+            f"ones in {100 * self.area():.1f} % of the comparisons",
+            f"{'least familiarity':>17} {'own refused, %':>16} {'foreign accepted, %':>21}{kinds}",
+        ]
+        for threshold in THRESHOLDS:
+            each = "".join(
+                f"{100 * self.accepted(threshold, k):9.1f}" for k in range(len(FOREIGN_KINDS))
+            )
+            lines.append(
+                f"{threshold:17.1f} {100 * self.refused(threshold):16.1f} "
+                f"{100 * self.accepted(threshold):21.1f}{each}"
+            )
+        return "\n".join(lines)
+
+
+def measure(aligner: Aligner, split: str, count: int) -> Familiarity:
+    """Over the first `count` samples of a set. Raises `IgaDrakeError` for an aligner that can't
+    tell."""
+    own, foreign = [], []
+    for index in range(count):
+        points = make_sample(split, index, CONFIG).points
+        mixed = foreign_points(points, foreign_sample(split, index, CONFIG).points, index)
+        for asked, values in ((points, own), (mixed, foreign)):
+            query = Query.of(asked, random_pose(index))
+            familiarity = aligner.align(*query.clouds, seed=index).familiarity
+            if familiarity is None:
+                raise IgaDrakeError(
+                    f"aligner {aligner.name}: gives no familiarity: use iga with a trained energy"
+                )
+            values.append(familiarity)
+    return Familiarity(split, tuple(own), tuple(foreign))
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument(
+        "--sets", default=",".join(DEFAULT_SETS), help=f"default {','.join(DEFAULT_SETS)}"
+    )
+    parser.add_argument("--count", type=int, default=100, help="samples of each set")
+    parser.add_argument("--json", action="store_true", help="every familiarity")
+
+
+def main(arguments: argparse.Namespace, aligner: Aligner | None = None) -> int:
+    """Prints both kinds of error by threshold."""
+    names: Sequence[str] = arguments.sets.split(",")
+    for name in names:
+        sample_set(name)
+    if arguments.count < 1:
+        raise IgaDrakeError(f"--count {arguments.count}: at least 1 is needed")
+    aligner = aligner or IgaAligner()
+    document = []
+    for name in names:
+        found = measure(aligner, name, arguments.count)
+        if arguments.json:
+            document.append(asdict(found) | {"area": found.area()})
+        else:
+            print(found.table() + "\n", flush=True)
+    if arguments.json:
+        print(json.dumps(document, indent=2))
+    return 0
