@@ -18,7 +18,7 @@ from typing import Any
 from iga_drake.errors import IgaDrakeError
 
 SUCCESS, FAILURE, BAD_INPUT = 0, 1, 2
-ALIGNERS = ("icp", "iga", "expert")
+ALIGNERS = ("icp", "iga", "iga-paper", "dirreg", "dfm", "expert")
 
 
 class CommandError(IgaDrakeError):

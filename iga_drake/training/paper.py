@@ -64,7 +64,7 @@ class PaperTraining(RunConfig):
     decay_share: float = 1.0
     weight_decay: float = 0.01
     ema: float = 0.999
-    bf16: bool = False
+    bf16: bool = True
     validation_samples: int = 8
     # Counter-examples of a sample; of the variants, the poses that a sample is trained on.
     candidates: int = 256
@@ -275,7 +275,7 @@ def candidates(
         rates = {"translation_rate": 0.0} if turns else {"rotation_rate": 0.0}
         chosen = LangevinConfig(steps=config.langevin_steps, **rates)  # type: ignore[arg-type]
         with torch.no_grad():
-            energy = energy_of(model.graph, asked.context(model.graph))
+            energy = energy_of(model.graph, asked.context(model.graph), bf16=config.bf16)
             found = langevin(energy, *start, chosen, generator)
         R = torch.cat((found[0], R[:, moving:]), 1)
         t = torch.cat((found[1], t[:, moving:]), 1)
@@ -295,6 +295,11 @@ def energy_loss(
     with torch.autocast(R.device.type, torch.bfloat16, enabled=config.bf16):
         context = asked.context(model.graph)
         E = model.graph(context, R, t)[..., 0].float()  # (S, 1 + M)
+        if config.gradient_penalty:
+            some = torch.randperm(R.shape[1], generator=generator, device=R.device)
+            some = some[: config.penalty_poses]
+            edges = model.graph.edges_between(context, R[:, some], t[:, some]).requires_grad_()
+            of_some = model.graph(context, R[:, some], t[:, some], edges).float().sum()
     nce = E[:, 0] + (-E).logsumexp(1)
     total = nce.sum() + config.energy_penalty * E.square().mean(1).sum()
     statistics = {
@@ -305,12 +310,8 @@ def energy_loss(
         "top1": (E.argmin(1) == 0).float().mean(),
     }
     if config.gradient_penalty:
-        some = torch.randperm(R.shape[1], generator=generator, device=R.device)
-        some = some[: config.penalty_poses]
-        edges = model.graph.edges_between(context, R[:, some], t[:, some]).requires_grad_()
-        of_some = model.graph(context, R[:, some], t[:, some], edges).sum()
         (gradient,) = torch.autograd.grad(of_some, edges, create_graph=True)
-        penalty = gradient.square().sum((-3, -2, -1)).mean(1).sum()
+        penalty = gradient.float().square().sum((-3, -2, -1)).mean(1).sum()
         total = total + config.gradient_penalty * penalty
         statistics["edge_gradient"] = penalty.detach() / len(E)
     return Term(total, torch.tensor(float(len(E)), device=R.device), statistics)
@@ -333,17 +334,20 @@ def variant_loss(
         )
     else:
         t = place[:, None] + t
-    context = asked.context(model.graph)
     identity = torch.eye(3, device=R.device).expand_as(R)
+    with torch.autocast(R.device.type, torch.bfloat16, enabled=config.bf16):
+        context = asked.context(model.graph)
+        if model.part == "dirreg":
+            found_R, found_t = correction_of(model.graph, context, R, t)
+        else:
+            said = distances_of(model.graph, context, R, t)
     if model.part == "dirreg":
-        found_R, found_t = correction_of(model.graph, context, R, t)
         off = (found_t - place[:, None]).norm(dim=-1)
         chord = (found_R - identity).square().sum((-2, -1))  # 4 - 4 cos of the angle
         total = (chord + off / DISTANCE_UNIT).mean(1).sum()
         with torch.no_grad():
             turn = geodesic_angle(found_R, identity)
     else:
-        said = distances_of(model.graph, context, R, t)
         turn = geodesic_angle(R, identity)
         true = torch.stack((turn, (t - place[:, None]).norm(dim=-1) / DISTANCE_UNIT), -1)
         total = torch.nn.functional.smooth_l1_loss(said, true, reduction="none").mean((1, 2)).sum()

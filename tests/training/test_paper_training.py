@@ -39,7 +39,7 @@ ENCODER = EncoderConfig(channels=CHANNELS, layers=2, point_layers=1, scalars=4)
 SAMPLES = SampleConfig(cloud_points=64, surface_points=400, least_seen=8)
 TRAINING = {
     "batch": 2, "accumulate": 1, "candidates": 12, "warmup": 1, "log_every": 1, "penalty_poses": 4,
-    "validation_particles": 4, "validation_steps": 3, "validation_samples": 1,
+    "bf16": False, "validation_particles": 4, "validation_steps": 3, "validation_samples": 1,
 }  # fmt: skip
 
 
@@ -185,6 +185,26 @@ def test_variants_are_right_where_they_say_the_truth(monkeypatch) -> None:
         assert term.total.item() == pytest.approx(0, abs=1e-4)
         assert term.statistics["translation_cm"] < 1e-3
         monkeypatch.undo()
+
+
+@pytest.mark.parametrize("part", ["rotation", "translation", "dirreg", "dfm"])
+def test_mixed_precision_changes_little(part: str) -> None:
+    """Positions keep their digits; far from the origin, too."""
+    model, some = _model(part), nodes(2, 2, 4)
+    some = Nodes(some.positions + 0.5, some.vectors)
+    loss = energy_loss if part in paper.ENERGIES else variant_loss
+    terms = [
+        loss(model, some, _config(bf16=bf16, wide_steps=9), 0, _generator())
+        for bf16 in (False, True)
+    ]
+    assert terms[1].total.item() == pytest.approx(terms[0].total.item(), rel=0.02)
+    gradients = []
+    for term in terms:
+        model.zero_grad()
+        term.total.backward()
+        flat = [p.grad.flatten() for p in model.parameters() if p.grad is not None]
+        gradients.append(torch.cat(flat))
+    assert torch.nn.functional.cosine_similarity(*gradients, dim=0) > 0.97
 
 
 # Samples

@@ -455,8 +455,15 @@ class GraphNetwork(nn.Module):
     def edges_between(self, context: Context, R: Tensor, t: Tensor) -> Tensor:
         """Features (S, M, K, K, E) of the edges to A's nodes from B's, A at poses R, t."""
         p_A, p_B = context.positions
-        p_A = p_A[:, None] @ R.mT + t[..., None, :]  # (S, M, K, 3)
-        return edge_features(p_B[:, None, None] - p_A[..., None, :], self.config.frequencies)
+        with torch.autocast(R.device.type, enabled=False):  # positions need their digits
+            p_A = p_A[:, None] @ R.mT + t[..., None, :]  # (S, M, K, 3)
+            return edge_features(p_B[:, None, None] - p_A[..., None, :], self.config.frequencies)
+
+    def _edges_of_A(self, context: Context, R: Tensor) -> Tensor:
+        """Features (S, M, K, K, E) of the edges between A's nodes."""
+        with torch.autocast(R.device.type, enabled=False):
+            p_A = context.positions[A][:, None] @ R.mT  # (S, M, K, 3)
+            return edge_features(p_A[..., None, :, :] - p_A[..., None, :], self.config.frequencies)
 
     def forward(
         self, context: Context, R: Tensor, t: Tensor, edges: Tensor | None = None
@@ -468,14 +475,12 @@ class GraphNetwork(nn.Module):
           R: (S, M, 3, 3) rotations from A's frame to B's; t: (S, M, 3) m.
           edges: of A and B in place of `edges_between`, for derivatives by them.
         """
-        L = self.config.frequencies
         e_AB = self.edges_between(context, R, t) if edges is None else edges
         # The way back has the opposite difference: sines change their signs.
         sign = torch.ones(self.config.edge, device=R.device, dtype=e_AB.dtype)
         sign[: self.config.edge // 2] = -1
         e_BA = (e_AB * sign).transpose(2, 3).contiguous()
-        p_A = context.positions[A][:, None] @ R.mT  # (S, M, K, 3)
-        e_AA = edge_features(p_A[..., None, :, :] - p_A[..., None, :], L)
+        e_AA = self._edges_of_A(context, R)
         c = self.class_token.expand(*R.shape[:2], -1)
         # First layer.
         first = context.layers[0]

@@ -15,15 +15,20 @@ from iga_drake.aligners.iga_paper.langevin import Energy, LangevinConfig, haar_r
 DISTANCE_UNIT = 0.1  # m, of the translations that networks put out
 
 
-def energy_of(network: GraphNetwork, context: Context) -> Energy:
-    """The energy that a network trained as one gives poses."""
-    return lambda R, t: network(context, R, t)[..., 0]
+def energy_of(network: GraphNetwork, context: Context, *, bf16: bool = False) -> Energy:
+    """The energy that a network trained as one gives poses; `bf16` for mixed precision."""
+
+    def energy(R: Tensor, t: Tensor) -> Tensor:
+        with torch.autocast(R.device.type, torch.bfloat16, enabled=bf16):
+            return network(context, R, t)[..., 0].float()
+
+    return energy
 
 
 def distances_of(network: GraphNetwork, context: Context, R: Tensor, t: Tensor) -> Tensor:
     """(S, M, 2): angle (rad) and distance (units of DISTANCE_UNIT) to the right pose, as a network
     trained to know them says."""
-    return torch.nn.functional.softplus(network(context, R, t))
+    return torch.nn.functional.softplus(network(context, R, t).float())
 
 
 def correction_of(
@@ -31,8 +36,9 @@ def correction_of(
 ) -> tuple[Tensor, Tensor]:
     """The right poses (S, M, 3, 3), (S, M, 3) as a network says that was trained to regress them
     from the poses R, t."""
-    turn, shift = network(context, R, t).split((6, 3), -1)
-    return rotation_of_six(turn) @ R, t + DISTANCE_UNIT * shift
+    turn, shift = network(context, R, t).float().split((6, 3), -1)
+    with torch.autocast(R.device.type, enabled=False):
+        return rotation_of_six(turn) @ R, t + DISTANCE_UNIT * shift
 
 
 def rotation_of_six(x: Tensor) -> Tensor:
