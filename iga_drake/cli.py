@@ -221,6 +221,7 @@ def _names(text: str) -> list[str]:
 
 # what is evaluated: module, its function that adds options, its function that evaluates
 EVALUATIONS = {
+    "ablations": ("iga_drake.evaluation.ablations", "add_ablations", "evaluate_ablations"),
     "tasks": ("iga_drake.cli", "_add_evaluate_tasks", "_evaluate_tasks"),
     "alignment": ("iga_drake.cli", "_add_evaluate_alignment", "_evaluate_alignment"),
     "deformations": (
@@ -228,7 +229,7 @@ EVALUATIONS = {
         "add_evaluate_deformations",
         "evaluate_deformations",
     ),
-    "foreign": ("iga_drake.evaluation.foreign", "add_arguments", "main"),
+    "familiarity": ("iga_drake.evaluation.familiarity", "add_arguments", "main"),
     "diagnosis": (
         "iga_drake.evaluation.diagnosis",
         "add_evaluate_diagnosis",

@@ -258,8 +258,6 @@ def train_energy(
             )
         model, config = before.model, config or before.training
     model, config = model or EnergyConfig(), config or EnergyTraining()
-    torch.manual_seed(config.seed)
-    net = PairEnergyNet(model).to(device)
     maker = ProblemMaker(Path(descriptor or default_weights()), model)
     folder = problems or output / "problems"
     sets = [
@@ -272,6 +270,8 @@ def train_energy(
         if count
     ]
     *training, held_out = sets
+    torch.manual_seed(config.seed)
+    net = PairEnergyNet(model).to(device)
 
     def validate(weights: dict[str, Tensor]) -> dict[str, float]:
         measured = copy.deepcopy(net).cpu()
@@ -314,16 +314,19 @@ def train_energy(
             )
     card = run.save()
     if run.ranks.first:
-        final = PairEnergyNet(model)
-        final.load_state_dict({n: t.cpu() for n, t in run.ema.items()})
-        results = {"validation": energy_errors(final, held_out.to("cpu"))}
-        if config.foreign_problems:
-            abroad = dataclasses.replace(maker, foreign=True)
-            foreign = make_problems(folder, ONE, config.foreign_problems, abroad, workers=workers)
-            own = make_problems(folder, ONE, config.foreign_problems, maker, workers=workers)
-            results["familiarity"] = fit_familiarity(final, own, foreign)
-            for name in ("familiar_weight", "familiar_bias"):
-                run.ema[name].copy_(getattr(final, name))
+        with torch.random.fork_rng(devices=[]):
+            final = PairEnergyNet(model)
+            final.load_state_dict({n: t.cpu() for n, t in run.ema.items()})
+            results = {"validation": energy_errors(final, held_out.to("cpu"))}
+            if config.foreign_problems:
+                abroad = dataclasses.replace(maker, foreign=True)
+                foreign = make_problems(
+                    folder, ONE, config.foreign_problems, abroad, workers=workers
+                )
+                own = make_problems(folder, ONE, config.foreign_problems, maker, workers=workers)
+                results["familiarity"] = fit_familiarity(final, own, foreign)
+                for name in ("familiar_weight", "familiar_bias"):
+                    run.ema[name].copy_(getattr(final, name))
         card = run.save(**results)
     run.close()
     return card

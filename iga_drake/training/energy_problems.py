@@ -34,12 +34,11 @@ CLOUD = 32  # points of the grasped cloud that errors are measured at
 
 @dataclass(frozen=True)
 class EnergyProblem:
-    """One sample; both test clouds about their centroids. float32 but for `there` and `index`."""
+    """One sample; both test clouds about their centroids. float32 but for `there`."""
 
     R: np.ndarray  # (K, D, C, 3, 3), and so on: see `PairProposals`
     place: np.ndarray
     part: np.ndarray
-    index: np.ndarray
     there: np.ndarray
     features: np.ndarray
     valid: np.ndarray  # (VALID, 4, 4) right poses of A, the last one repeated
@@ -86,7 +85,6 @@ class ProblemMaker:
             proposals.R.float().numpy(),
             proposals.place.float().numpy(),
             proposals.part.float().numpy(),
-            proposals.index.numpy(),
             proposals.there.numpy(),
             proposals.features.float().numpy(),
             _padded(about_centroids(valid), VALID),
@@ -117,11 +115,12 @@ class Problems:
         return len(self.tensors["R"])
 
     def proposals(self, index: int) -> PairProposals:
-        """Of one problem."""
-        t = self.tensors
-        return PairProposals(
-            *(t[name][index] for name in ("R", "place", "part", "index", "there", "features"))
+        """Of one problem; which nodes its parts are is not kept."""
+        R, place, part, there, features = (
+            self.tensors[name][index] for name in ("R", "place", "part", "there", "features")
         )
+        unknown = torch.zeros(len(part), 2, dtype=torch.int64, device=part.device)
+        return PairProposals(R, place, part, unknown, there, features)
 
     def valid(self, index: int) -> Tensor:
         """(VALID, 4, 4)."""

@@ -355,6 +355,8 @@ def test_known_poses_have_known_errors(frames: str, monkeypatch) -> None:
 def test_bad_settings_are_named(tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="own, common"):
         PaperTraining(frames="other")
+    with pytest.raises(TrainingError, match="validation_split = 'none'"):
+        PaperTraining(validation_split="none")
     with pytest.raises(TrainingError, match="rotation, translation, dirreg, dfm"):
         train_paper(tmp_path, "magic")
 

@@ -55,7 +55,7 @@ class PairProposals:
     R: Tensor  # (K, D, C, 3, 3) rotations of A into B's frame, both about their centroids
     place: Tensor  # (K, D, C, 3) m, where they put A's part
     part: Tensor  # (K, 3) m, A's part in A's frame
-    index: Tensor  # (K, 2) int64: which of A's and of B's nodes the parts are
+    nodes: Tensor  # (K, 2) int64: which of A's and of B's nodes the parts are
     there: Tensor  # (D, C) bool: false where a demonstration has fewer combinations
     features: Tensor  # (K, D, C, FEATURES), invariants
 
@@ -110,7 +110,7 @@ class PairProposals:
             self.R.to(device, dtype),
             self.place.to(device, dtype),
             self.part.to(device, dtype),
-            self.index.to(device),
+            self.nodes.to(device),
             self.there.to(device),
             self.features.to(device, dtype),
         )
@@ -122,7 +122,7 @@ class PairProposals:
             self.R[:, at],
             self.place[:, at],
             self.part,
-            self.index,
+            self.nodes,
             self.there[at],
             self.features[:, at],
         )
@@ -276,7 +276,7 @@ class Energy:
 
     def pair_weights(self, X: Tensor) -> Tensor:
         """(P, Q) share of every pair of parts in a pose X (4, 4), up to the last parts kept."""
-        i, j = self.proposals.index.unbind(-1)
+        i, j = self.proposals.nodes.unbind(-1)
         P, Q = int(i.max()) + 1, int(j.max()) + 1
         share = self.shares(X[None])[0]
         return torch.zeros(P * Q).to(share).index_add(0, i * Q + j, share).reshape(P, Q)

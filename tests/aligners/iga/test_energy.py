@@ -144,7 +144,7 @@ def test_an_untrained_energy_of_one_pair_is_a_gaussian() -> None:
         proposals.R[:1, :, :1],
         proposals.place[:1, :, :1],
         proposals.part[:1],
-        proposals.index[:1],
+        proposals.nodes[:1],
         proposals.there[:, :1],
         torch.zeros_like(proposals.features[:1, :, :1]),
     )
@@ -213,7 +213,7 @@ def test_a_demonstration_of_something_else_is_outvoted() -> None:
     X = other @ proposals.poses()[:, 0]
     R[:, 0], place[:, 0] = X[..., :3, :3], transform(X, proposals.part[:, None, None])[..., 0, :]
     mixed = PairProposals(
-        R, place, proposals.part, proposals.index, proposals.there, proposals.features
+        R, place, proposals.part, proposals.nodes, proposals.there, proposals.features
     )
     X, energy = minimise(PairEnergyNet(CONFIG).double()(mixed))
     assert float(geodesic_angle(X[0, :3, :3], right[:3, :3])) < 0.02
