@@ -217,15 +217,25 @@ def in_common_frames(sample: Sample) -> Sample:
     return dataclasses.replace(sample, points=turned.numpy())
 
 
-def compare(entry: Trained, split: str, count: int, *, frames: str = "own") -> Compared:
+def compare(
+    entry: Trained,
+    split: str,
+    count: int,
+    *,
+    frames: str = "own",
+    cloud_points: int = CONFIG.cloud_points,
+) -> Compared:
     """Errors of an aligner on the first `count` samples of a set."""
     if split not in sample_sets():
         raise IgaDrakeError(f"set '{split}' is not known; one of: {', '.join(sample_sets())}")
     if count < 1:
         raise IgaDrakeError(f"count {count}: at least 1 sample is needed")
+    if cloud_points < 16:
+        raise IgaDrakeError(f"--cloud-points {cloud_points}: at least 16 are needed")
     rows, seconds = [], []
     for index in range(count):
-        sample = make_sample(split, index, CONFIG)
+        config = dataclasses.replace(CONFIG, cloud_points=cloud_points)
+        sample = make_sample(split, index, config)
         if frames == "common":
             sample = in_common_frames(sample)
         query = Query.of(sample.points, random_pose(index))
@@ -301,6 +311,10 @@ def add_compare(parser: argparse.ArgumentParser) -> None:
         help="common: demonstrations turned as the test pair's target stands, as in the paper's "
         "data",
     )  # fmt: skip
+    parser.add_argument(
+        "--cloud-points", type=int, default=CONFIG.cloud_points,
+        help="of a cloud; as many as in training, with the set train: the very training samples",
+    )  # fmt: skip
     parser.add_argument("--particles", type=int, default=LangevinConfig.particles)
     parser.add_argument("--steps", type=int, default=LangevinConfig.steps, help="of the samplers")
     parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch")
@@ -324,7 +338,13 @@ def evaluate_compare(arguments: argparse.Namespace) -> None:
         for path in chosen:
             entry = trained(name, path, particles=arguments.particles, steps=arguments.steps)
             for split in arguments.sets.split(","):
-                found = compare(entry, split.strip(), arguments.count, frames=arguments.frames)
+                found = compare(
+                    entry,
+                    split.strip(),
+                    arguments.count,
+                    frames=arguments.frames,
+                    cloud_points=arguments.cloud_points,
+                )
                 rows.append(found)
                 if not arguments.json:
                     print(found.row(), flush=True)

@@ -40,6 +40,7 @@ from iga_drake.checkpoint import CheckpointError, load_checkpoint
 from iga_drake.dataset.alignment_error import displacement, equivalents, nearest_error
 from iga_drake.dataset.loader import Batch, collate, sample_loader
 from iga_drake.dataset.samples import SampleConfig, make_sample
+from iga_drake.dataset.splits import sample_sets
 from iga_drake.geometry.se3 import geodesic_angle, kabsch, rigid, so3_exp
 from iga_drake.paths import models_dir
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
@@ -91,6 +92,7 @@ class PaperTraining(RunConfig):
     # in the paper's data, target objects turned alike in all alignments of a sample.
     frames: str = "own"
     turned: bool = False  # each sample as a whole, at random at every use: more data than there is
+    validation_split: str = "validation"  # set; "train" while it learns a subset of that
     validation_particles: int = 32
     validation_steps: int = 40
 
@@ -102,6 +104,11 @@ class PaperTraining(RunConfig):
         for name in ("subset", "langevin_every", "energy_penalty", "gradient_penalty"):
             if getattr(self, name) < 0:
                 raise TrainingError(f"{name} = {getattr(self, name)}, must not be below 0")
+        if self.validation_split not in sample_sets():
+            raise TrainingError(
+                f"validation_split = '{self.validation_split}', must be one of: "
+                f"{', '.join(sample_sets())}"
+            )
         if self.frames not in FRAMES:
             raise TrainingError(f"frames = '{self.frames}', must be one of: {', '.join(FRAMES)}")
 
@@ -437,7 +444,13 @@ def _validation_errors(
     weights: dict[str, Tensor], *, card: dict, config: PaperTraining, samples: SampleConfig
 ) -> dict[str, float]:
     model = PaperModel.described(card).with_weights(weights)
-    return part_errors(model, config, count=config.validation_samples, samples=samples)
+    return part_errors(
+        model,
+        config,
+        split=config.validation_split,
+        count=config.validation_samples,
+        samples=samples,
+    )
 
 
 # Training

@@ -11,10 +11,18 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from iga_drake import cli
+from iga_drake.aligners.iga_paper import aligner as paper_aligner
+from iga_drake.aligners.iga_paper.aligner import IgaPaperAligner
+from iga_drake.aligners.iga_paper.graph import moved
+from iga_drake.aligners.iga_paper.nodes import problem
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.dataset.alignment_error import CONFIG, random_pose
+from iga_drake.dataset.loader import collate
 from iga_drake.dataset.samples import make_sample
+from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.compare import Trained, compare, counted, in_common_frames, paper_flops
+from iga_drake.geometry.se3 import rigid
+from iga_drake.training.paper import nodes_of
 
 
 def test_operations_of_a_known_product() -> None:
@@ -73,6 +81,32 @@ def test_common_frames_leave_the_test_pair_alone() -> None:
         before, after = (s.points[:, n].reshape(-1, 3) for s in (sample, turned))
         R, off = Rotation.align_vectors(after - after.mean(0), before - before.mean(0))
         assert off < 1e-3 and R.magnitude() > 0.01
+
+
+def test_training_samples_are_seen_as_in_training(monkeypatch) -> None:
+    """With as many points as there are, the nodes of the test are those of the training."""
+    net, seen = model("translation"), []
+    asked = paper_aligner.Asked.of
+
+    def remember(*arguments, **options):
+        seen.append(asked(*arguments, **options).problem)
+        raise IgaDrakeError("enough")
+
+    monkeypatch.setattr(paper_aligner.Asked, "of", staticmethod(remember))
+    aligner = IgaPaperAligner((net, net))
+    entry = Trained("iga-paper", "", aligner, 1, 1.0, 1.0)
+    with pytest.raises(IgaDrakeError, match="enough"):
+        compare(entry, "train", 1, frames="common", cloud_points=256)
+    nodes, _ = nodes_of(collate([make_sample("train", 0)]), net, "common", "cpu")
+    trained = problem(nodes)
+    for ours, theirs in zip(seen[0].demonstrations, trained.demonstrations, strict=True):
+        offsets = [n.positions - n.positions[:, :, :1] for n in (ours, theirs)]
+        torch.testing.assert_close(*offsets, atol=1e-5, rtol=0)
+        torch.testing.assert_close(ours.vectors, theirs.vectors, atol=1e-3, rtol=1e-3)
+    R = torch.from_numpy(random_pose(0)[:3, :3]).float()
+    turned = moved(trained.test[0], rigid(R, torch.zeros(3)))
+    torch.testing.assert_close(seen[0].test[0].positions, turned.positions, atol=1e-5, rtol=0)
+    torch.testing.assert_close(seen[0].test[1], trained.test[1], atol=1e-3, rtol=1e-3)
 
 
 def test_table_and_figure(tmp_path: Path, capsys) -> None:
