@@ -17,6 +17,13 @@ import torch
 from torch import Tensor, nn
 
 from iga_drake.aligners.iga.vector_neurons import VectorLinear
+from iga_drake.errors import IgaDrakeError
+
+LOCALS = ("moments", "encoder", "coordinates")
+
+
+class DescriptorError(IgaDrakeError):
+    """The network can't be built as asked."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,41 @@ class DescriptorConfig:
     descriptor: int = 64
     # Whether nodes attend to the object's other clouds after every layer but the last.
     cross: bool = True
+    # What first looks at the surroundings of a node: moments over the shells; or, for comparison,
+    # the local encoder, or the moments as plain coordinates (not invariant): see local_stages.py.
+    local: str = "moments"
+
+    def __post_init__(self) -> None:
+        if self.local not in LOCALS:
+            raise DescriptorError(f"local = '{self.local}', must be one of: {', '.join(LOCALS)}")
+
+
+def shell_moments(x: Tensor, p: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Moments of dense clouds x (B, P, 3) over radial shells around nodes p (B, M, 3).
+
+    Shares of the points (B, M, S, 1); mean offsets from the node (B, M, S, 3) and second moments
+    about it (B, M, S, 3, 3), in units of the shell's radius and of its square.
+    """
+    B, M, _ = p.shape
+    S = len(radii)
+    distance = torch.cdist(p, x)[:, :, None]  # (B, M, 1, P)
+    r = radii.to(x.dtype)[:, None]
+    # Compact window of each shell: (1 - ((d - r) / 0.9 r)^2)_+^2, in place (no parameters).
+    window = (distance * (1 / (0.9 * r))).sub_(1 / 0.9)
+    window = window.square_().neg_().add_(1).clamp_min_(0).square_()
+    outer = (x[..., :, None] * x[..., None, :]).flatten(2)
+    powers = torch.cat((torch.ones_like(x[..., :1]), x, outer), -1)
+    # In this order (few rows, not few columns) it is quicker.
+    moments = (powers.mT @ window.flatten(1, 2).mT).mT
+    moments = moments.reshape(B, M, S, 13) / x.shape[1]
+    mass = moments[..., :1].clamp_min(1e-5)
+    mean = moments[..., 1:4] / mass
+    second = (moments[..., 4:] / mass).reshape(B, M, S, 3, 3)
+    q = p[:, :, None]
+    offset = (mean - q) / r
+    mean_q = mean[..., :, None] * q[..., None, :]
+    second = second - mean_q - mean_q.transpose(-1, -2) + q[..., :, None] * q[..., None, :]
+    return mass, offset, second / r[..., None] ** 2
 
 
 class LocalMoments(nn.Module):
@@ -63,26 +105,8 @@ class LocalMoments(nn.Module):
 
     def forward(self, x: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         # x (B, P, 3) dense cloud, p (B, M, 3) nodes -> scalars (B, M, d), vectors (B, M, 3, c)
-        B, M, _ = p.shape
-        S = len(self.radii)
-        distance = torch.cdist(p, x)[:, :, None]  # (B, M, 1, P)
-        r = self.radii.to(x.dtype)[:, None]
-        # Compact window of each shell: (1 - ((d - r) / 0.9 r)^2)_+^2, in place (no parameters).
-        window = (distance * (1 / (0.9 * r))).sub_(1 / 0.9)
-        window = window.square_().neg_().add_(1).clamp_min_(0).square_()
-        outer = (x[..., :, None] * x[..., None, :]).flatten(2)
-        powers = torch.cat((torch.ones_like(x[..., :1]), x, outer), -1)
-        # In this order (few rows, not few columns) it is quicker.
-        moments = (powers.mT @ window.flatten(1, 2).mT).mT
-        moments = moments.reshape(B, M, S, 13) / x.shape[1]
-        mass = moments[..., :1].clamp_min(1e-5)
-        mean = moments[..., 1:4] / mass
-        second = (moments[..., 4:] / mass).reshape(B, M, S, 3, 3)
+        mass, offset, second = shell_moments(x, p, self.radii)
         q = p[:, :, None]
-        offset = (mean - q) / r  # (B, M, S, 3)
-        mean_q = mean[..., :, None] * q[..., None, :]
-        second = second - mean_q - mean_q.transpose(-1, -2) + q[..., :, None] * q[..., None, :]
-        second = second / r[..., None] ** 2
         base = torch.cat((offset, -q), 2).transpose(-1, -2)  # (B, M, 3, S + 1)
         v = self.mix(base)
         bent = (second @ v[:, :, None]).transpose(2, 3).flatten(3)  # (B, M, 3, S c)
@@ -227,6 +251,17 @@ class CrossLayer(nn.Module):
         return s + self.mlp(self.norm2(torch.cat((s, message), -1)))
 
 
+def _local_stage(config: DescriptorConfig) -> nn.Module:
+    """Clouds (B, P, 3), nodes (B, M, 3) -> scalars (B, M, d), vectors (B, M, 3, c)."""
+    if config.local == "moments":
+        return LocalMoments(config)
+    from iga_drake.aligners.iga import local_stages  # which imports this module
+
+    if config.local == "encoder":
+        return local_stages.LocalParts(config)
+    return local_stages.LocalCoordinates(config)
+
+
 class DescriptorNet(nn.Module):
     """Clouds (B, P, 3) and node indices (B, M) -> unit descriptors (B, M, D).
 
@@ -236,7 +271,7 @@ class DescriptorNet(nn.Module):
     def __init__(self, config: DescriptorConfig):
         super().__init__()
         self.config = config
-        self.local = LocalMoments(config)
+        self.local = _local_stage(config)
         self.layers = nn.ModuleList(ContextLayer(config) for _ in range(config.layers))
         crossings = config.layers - 1 if config.cross else 0
         self.cross = nn.ModuleList(CrossLayer(config) for _ in range(crossings))
@@ -278,6 +313,8 @@ class DescriptorNet(nn.Module):
         for module in self.modules():
             if isinstance(module, VectorLinear):
                 module.double()
+        if self.config.local == "encoder":
+            self.local.encoder.double()  # type: ignore[operator, union-attr]
         return self
 
     def compile_layers(self) -> None:

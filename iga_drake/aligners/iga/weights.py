@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
+from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorError, DescriptorNet
 from iga_drake.aligners.iga.energy import EnergyConfig, PairEnergyNet
 from iga_drake.checkpoint import CheckpointError, load_checkpoint
 
@@ -11,7 +11,7 @@ ENERGY = "energy"
 
 
 def descriptor_config(card: dict) -> DescriptorConfig:
-    """The network's sizes as saved in a model card."""
+    """The network's sizes as saved in a model card; what older ones lack is the default."""
     fields = dict(card["model"])
     fields["shells"] = tuple(fields["shells"])
     fields.setdefault("cross", False)  # checkpoints from before there was any
@@ -24,7 +24,7 @@ def load_descriptor(path: Path) -> tuple[DescriptorNet, dict]:
     try:
         net = DescriptorNet(descriptor_config(card))
         net.load_state_dict(tensors)
-    except (KeyError, TypeError, RuntimeError) as error:
+    except (KeyError, TypeError, RuntimeError, DescriptorError) as error:
         raise CheckpointError(
             f"{path}: card and tensors don't describe this release's network ({error}): train one "
             "with `iga train` or name another"
