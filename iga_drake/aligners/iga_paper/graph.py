@@ -191,11 +191,11 @@ class _Projection(NamedTuple):
         matrices, biases = zip(*maps, strict=True)
         return _Projection(torch.cat(matrices), torch.cat(biases), heads)
 
-    def __call__(self, h: Tensor) -> Tensor:
-        """Features (S, M, K, D) to (P, H, S, M, K, d)."""
+    def __call__(self, h: Tensor) -> tuple[Tensor, ...]:
+        """Features (S, M, K, D) to P tensors (H, S, M, K, d)."""
         mapped = nn.functional.linear(h, self.matrix, self.bias)
         mapped = mapped.unflatten(-1, (-1, self.heads, h.shape[-1] // self.heads))
-        return mapped.permute(3, 4, 0, 1, 2, 5).contiguous()
+        return mapped.permute(3, 4, 0, 1, 2, 5).contiguous().unbind(0)
 
     def of_rotated(self, Y: Tensor, bias: Tensor) -> "_OfRotation":
         """The same maps of features sum_r R_r Y_r + bias, Y (S, 9, K, D), as functions of R."""
@@ -214,11 +214,11 @@ class _OfRotation(NamedTuple):
     coefficients: Tensor  # (P, H, S, 9, K, d)
     constant: Tensor  # (P, H, 1, 1, 1, d)
 
-    def __call__(self, R: Tensor) -> Tensor:
-        """(P, H, S, M, K, d) at rotations (S, M, 3, 3)."""
+    def __call__(self, R: Tensor) -> tuple[Tensor, ...]:
+        """P tensors (H, S, M, K, d) at rotations (S, M, 3, 3)."""
         P, H, _, _, K, _ = self.coefficients.shape
         linear = R.flatten(-2) @ self.coefficients.flatten(0, 1).flatten(-2)  # (P H, S, M, K d)
-        return linear.unflatten(-1, (K, -1)).unflatten(0, (P, H)) + self.constant
+        return (linear.unflatten(-1, (K, -1)).unflatten(0, (P, H)) + self.constant).unbind(0)
 
 
 _Map = tuple[Tensor, Tensor]  # matrix (D, D) and bias (D,)
@@ -332,7 +332,7 @@ class Context(NamedTuple):
     features_A: _OfRotation  # P = H = 1
     projected_A: _OfRotation
     features_B: Tensor  # (S, 1, K, D)
-    projected_B: Tensor  # (P, H, S, 1, K, d)
+    projected_B: tuple[Tensor, ...]  # P of (H, S, 1, K, d)
     message_B: Tensor  # (H, S, 1, K, d), all but what A tells
 
 
@@ -485,7 +485,7 @@ class GraphNetwork(nn.Module):
         # First layer.
         first = context.layers[0]
         own_A, own_B = context.projected_A(R), context.projected_B
-        h: tuple[Tensor, Tensor] = (context.features_A(R)[0, 0], context.features_B)
+        h: tuple[Tensor, Tensor] = (context.features_A(R)[0][0], context.features_B)
         q_B = own_B[3].expand(-1, -1, R.shape[1], -1, -1)
         to_A = (
             own_A[7]
