@@ -217,7 +217,7 @@ def fit_familiarity(net: PairEnergyNet, own: Problems, foreign: Problems) -> dic
         optimizer.zero_grad()
         logits = z @ weight[:-1] + weight[-1]
         loss = nn.functional.binary_cross_entropy_with_logits(logits, y, share, reduction="sum")
-        loss = loss + 1e-3 * weight[:-1].square().sum()
+        loss = loss + 0.5 / len(z) * weight[:-1].square().sum()  # unit prior
         loss.backward()
         return loss
 
