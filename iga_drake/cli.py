@@ -281,12 +281,15 @@ def _add_evaluate_alignment(alignment: argparse.ArgumentParser) -> None:
     alignment.add_argument("--results", type=Path, help="results file to append to and go on from")
     alignment.add_argument("--by-category", action="store_true", help="also by kind of object")
     alignment.add_argument("--weights", type=Path, help="weights of iga (default: the landed ones)")
+    alignment.add_argument("--energy", type=Path, help="energy of iga (default: the landed one)")
     alignment.add_argument("--card", type=Path, help="write a model card of iga's weights")
+    alignment.add_argument("--energy-card", type=Path, help="write one of its energy")
     alignment.add_argument("--json", action="store_true", help="print the errors as JSON")
 
 
 def _evaluate_alignment(arguments: argparse.Namespace) -> int:
-    from iga_drake.aligners.iga.aligner import default_weights
+    from iga_drake.aligners.iga.aligner import default_energy, default_weights
+    from iga_drake.aligners.iga.weights import ENERGY
     from iga_drake.aligners.registry import make_aligner
     from iga_drake.evaluation.alignment import (
         FIVE_SETS,
@@ -299,11 +302,16 @@ def _evaluate_alignment(arguments: argparse.Namespace) -> int:
     )
 
     weights = arguments.weights or default_weights()
+    energy = arguments.energy or default_energy()
+    own: dict[str, dict[str, Path]] = {
+        "iga": {"weights": weights, "energy": energy},
+        "iga-vote": {"weights": weights},
+    }
     summaries = []
     if not arguments.json:
         print(HEADER)
     for name in arguments.aligner:
-        options = {"weights": weights} if name == "iga" else {}
+        options = own.get(name, {})
         aligner = None if name == ORACLE else make_aligner(name, **options)
         rows = []
         for chosen in arguments.sets or FIVE_SETS:
@@ -312,7 +320,7 @@ def _evaluate_alignment(arguments: argparse.Namespace) -> int:
                 chosen,
                 arguments.count,
                 results=arguments.results,
-                version=digest(weights) if name == "iga" else "",
+                version="+".join(digest(path) for path in options.values()),
             )
             summaries.append(summary)
             rows += found
@@ -324,6 +332,8 @@ def _evaluate_alignment(arguments: argparse.Namespace) -> int:
         print(json.dumps([asdict(summary) for summary in summaries], indent=2))
     if arguments.card:
         write_text(arguments.card, model_card(weights, summaries))
+    if arguments.energy_card:
+        write_text(arguments.energy_card, model_card(energy, summaries, kind=ENERGY))
     return SUCCESS
 
 

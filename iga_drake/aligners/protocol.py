@@ -56,8 +56,8 @@ class PoseEstimate:
     poses: np.ndarray  # (M, 4, 4) float64
     energies: np.ndarray  # (M,) ascending
     probabilities: np.ndarray  # (M,) sums to 1
-    # Probability that the demonstrations show these objects, aligned in one of these ways; calibrated
-    # on contexts of other objects. None where the aligner can't tell.
+    # Probability that the demonstrations show these objects; calibrated on contexts of other
+    # objects. None where the aligner can't tell.
     familiarity: float | None = None
 
     def __post_init__(self) -> None:

@@ -18,6 +18,12 @@ def _iga(**options: Any) -> Aligner:
     return IgaAligner(**options)
 
 
+def _iga_vote(**options: Any) -> Aligner:
+    from iga_drake.aligners.iga.aligner import IgaAligner
+
+    return IgaAligner(energy=None, **options)
+
+
 def _iga_paper(**options: Any) -> Aligner:
     from iga_drake.aligners.iga_paper.aligner import IgaPaperAligner
 
@@ -39,6 +45,7 @@ def _dfm(**options: Any) -> Aligner:
 ALIGNERS: dict[str, Callable[..., Aligner]] = {
     "icp": _icp,
     "iga": _iga,
+    "iga-vote": _iga_vote,
     "iga-paper": _iga_paper,
     "dirreg": _dirreg,
     "dfm": _dfm,

@@ -252,15 +252,16 @@ def digest(weights: Path) -> str:
     return sha256(weights.read_bytes()).hexdigest()[:16]
 
 
-def model_card(weights: Path, errors: list[AlignmentErrors]) -> str:
-    """Markdown: how the weights were trained (from the file itself) and their errors."""
-    _, card = load_checkpoint(weights, kind=DESCRIPTOR)
+def model_card(weights: Path, errors: list[AlignmentErrors], *, kind: str = DESCRIPTOR) -> str:
+    """Markdown: how weights of a kind were trained (from the file itself), and errors with them."""
+    _, card = load_checkpoint(weights, kind=kind)
     seed, commit = card["training"]["seed"], card.get("commit") or "unknown"
+    seen = "samples seen" if kind == DESCRIPTOR else "problems seen"
     lines = [
         f"# {weights.name}",
         "",
         f"{card['parameters']:,} parameters, {card['step']:,} steps, {card['samples_seen']:,} "
-        f"samples seen in {card['seconds'] / 60:.0f} minutes, seed {seed}, commit {commit}, "
+        f"{seen} in {card['seconds'] / 60:.0f} minutes, seed {seed}, commit {commit}, "
         f"SHA-256 {digest(weights)}.",
         "",
         "Errors: four demonstrations, the test pair's grasped cloud at a Haar-random pose; "
@@ -272,7 +273,8 @@ def model_card(weights: Path, errors: list[AlignmentErrors]) -> str:
         "```",
         "",
     ]
-    for name in ("model", "training", "samples"):
+    described = [n for n in ("model", "training", "samples", "familiarity") if n in card]
+    for name in described:
         lines.append(f"`{name}`: " + ", ".join(f"{k} {v}" for k, v in card[name].items()))
         lines.append("")
     return "\n".join(lines)

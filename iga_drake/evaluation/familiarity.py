@@ -1,4 +1,4 @@
-"""`iga evaluate familiarity`: how well an aligner tells objects that its demonstrations never showed.
+"""`iga evaluate familiarity`: how well an aligner tells objects that no demonstration showed.
 
 Every sample of a set is asked twice: as it is, and with demonstrations of other objects (for both,
 the grasped or the target object in turn; never of the same family). A caller refuses below a

@@ -25,7 +25,7 @@ from iga_drake.evaluation.figures import check_figure, new_figure, write_figure
 SCALING_SET = "diversity_medium"
 DIVERSITY_SETS = ("diversity_low", "diversity_medium", "diversity_high")
 DIVERSITY_NUMBERS = (1, 2, 4, 8, 15)
-STAGES = ("describe", "across", "match", "vote")
+STAGES = ("describe", "across", "match", "vote", "energy")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import copy
 import dataclasses
 import math
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -284,7 +285,10 @@ def train_energy(
         net,
         config,
         saved=saved,
-        card={"model": dataclasses.asdict(model)},
+        card={
+            "model": dataclasses.asdict(model),
+            "descriptor": sha256(maker.descriptor.read_bytes()).hexdigest()[:16],
+        },
         options=options,
         validate=validate,
     )

@@ -72,10 +72,8 @@ class IgaAligner:
     """`Aligner` by dense SE(3)-invariant correspondence, consistency voting, and the learned
     factorised energy that ranks and refines what they propose.
 
-    Without an energy the vote's own agreement takes its place.
+    Without an energy (`iga-vote`) the vote's own agreement takes its place.
     """
-
-    name = "iga"
 
     def __init__(
         self,
@@ -101,6 +99,7 @@ class IgaAligner:
             energy = None
         if isinstance(energy, (str, Path)):
             energy, _ = load_energy(default_energy() if energy == LANDED else Path(energy))
+        self.name = "iga" if energy is not None else "iga-vote"
         self._energy = copy.deepcopy(energy).eval().double() if energy is not None else None
         # Double precision where it counts: choices between near ties must not depend on the clouds'
         # frames.
