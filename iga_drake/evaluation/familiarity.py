@@ -72,7 +72,8 @@ class Familiarity:
 def measure(aligner: Aligner, split: str, count: int) -> Familiarity:
     """Over the first `count` samples of a set. Raises `IgaDrakeError` for an aligner that can't
     tell."""
-    own, foreign = [], []
+    own: list[float] = []
+    foreign: list[float] = []
     for index in range(count):
         points = make_sample(split, index, CONFIG).points
         mixed = foreign_points(points, foreign_sample(split, index, CONFIG).points, index)
