@@ -128,7 +128,7 @@ def ablated(
     return model, dataclasses.replace(config, **changes[name])
 
 
-HEADER = f"{'run':<22} {'home':>6} {'nearer':>7} {'uphill':>7}  ends (median)  {'loss':>6}"
+HEADER = f"{'run':<24} {'home':>6} {'nearer':>7} {'uphill':>7}  ends (median)  {'loss':>6}"
 
 
 def row(name: str, part: str, found: Landscape, loss: float | None) -> str:
@@ -136,7 +136,7 @@ def row(name: str, part: str, found: Landscape, loss: float | None) -> str:
     unit = "deg" if part == "rotation" else "cm"
     text = "" if loss is None else f"{loss:6.3f}"
     return (
-        f"{name:<22} {100 * found.home:5.1f}% {100 * found.nearer:6.1f}% "
+        f"{name:<24} {100 * found.home:5.1f}% {100 * found.nearer:6.1f}% "
         f"{100 * found.uphill:6.1f}%  {found.final_median:8.2f} {unit:<4} {text}"
     )
 
@@ -185,7 +185,7 @@ def evaluate_stabilisers(arguments: argparse.Namespace) -> None:
         loss = _last_loss(path.parent)
         results[name] = asdict(found) | {"loss": loss}
         if not arguments.json:
-            print(row(name, part, found, loss), flush=True)
+            print(row(Path(name).stem, part, found, loss), flush=True)
     if arguments.json:
         print(json.dumps(results, indent=2))
 

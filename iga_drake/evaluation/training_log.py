@@ -80,6 +80,9 @@ def log_figure(logs: dict[str, tuple[list[dict], list[dict]]], path: Path) -> No
         error.set_title("validation")
         if error.lines:
             error.legend(fontsize=7)
+        for panel in (energy, error):
+            if not panel.lines:
+                panel.text(0.5, 0.5, "none", transform=panel.transAxes, ha="center")
         for panel in (loss, energy, error):
             panel.set_xlabel("step")
             panel.grid(alpha=0.3)

@@ -127,7 +127,7 @@ class SpectralLinear(nn.Module):
         if spectral:
             left = nn.functional.normalize(torch.randn(outputs), dim=0)
             self.left = nn.Parameter(left, requires_grad=False)
-            self.power_iteration(20)
+            self.power_iteration(8)
 
     @torch.no_grad()
     def power_iteration(self, count: int = 1) -> None:

@@ -14,7 +14,7 @@ from iga_drake.checkpoint import CheckpointError, load_checkpoint, save_checkpoi
 # What is trained, and how many numbers the network puts out: energies of rotations or of
 # translations; the transform itself (DirReg); its distance to the right one (DFM).
 OUTPUTS = {"rotation": 1, "translation": 1, "dirreg": 9, "dfm": 2}
-SETTLED = 100  # power iterations of weights that stay as they are
+SETTLED = 40  # power iterations of weights that stay as they are
 
 
 def kind_of(part: str) -> str:
