@@ -50,7 +50,9 @@ from iga_drake.training.paper import (
 from iga_drake.training.settings import replaced
 
 PARTS = {"iga-paper": ("rotation", "translation"), "dirreg": ("dirreg",), "dfm": ("dfm",)}
-LEARNED = ("iga", *PARTS)
+DESCRIPTORS = ("iga", "iga-vote")  # of their training, that of the descriptors is counted
+LEARNED = (*DESCRIPTORS, *PARTS)
+COMPARED = ("iga", *PARTS)
 
 
 @dataclass(frozen=True)
@@ -172,7 +174,7 @@ def trained(name: str, weights: Path | None, *, particles: int, steps: int) -> T
     """
     if name not in LEARNED:
         raise IgaDrakeError(f"aligner '{name}' is not compared; one of: {', '.join(LEARNED)}")
-    if name == "iga":
+    if name in DESCRIPTORS:
         path = weights or default_weights()
         aligner = make_aligner(name, weights=path)
         _, card = load_checkpoint(path, kind="descriptor")
@@ -299,7 +301,7 @@ def _weights(text: str) -> tuple[str, Path]:
 def add_compare(parser: argparse.ArgumentParser) -> None:
     """Options of `iga evaluate compare`."""
     parser.description = "Learned aligners on the same problems, and what their training took."
-    parser.add_argument("--aligners", default=",".join(LEARNED), help="names, comma-separated")
+    parser.add_argument("--aligners", default=",".join(COMPARED), help="names, comma-separated")
     parser.add_argument(
         "--weights", type=_weights, action="append", default=[], metavar="NAME=PATH",
         help="of an aligner (of iga-paper a folder), also several; default: the landed ones",
