@@ -260,6 +260,35 @@ def compare(
     )
 
 
+def model_card(rows: Sequence[Compared], cards: dict[str, dict], frames: str) -> str:
+    """Markdown: how networks were trained (from their own cards) and what they are off by."""
+    lines = ["# " + ", ".join(cards), ""]
+    for title, card in cards.items():
+        seed, commit = card["training"].get("seed", 0), card.get("commit") or "unknown"
+        lines += [
+            f"`{title}`: {card.get('parameters', 0):,} parameters with the encoder, "
+            f"{card['step']:,} steps, {card['samples_seen']:,} samples seen in "
+            f"{card['seconds'] / 60:.0f} minutes, seed {seed}, commit {commit}.",
+            "",
+        ]
+    told = "each in a frame of its own" if frames == "own" else "all targets turned alike"
+    lines += [
+        f"Errors modulo symmetry: four demonstrations, {told}; the test pair's grasped cloud at a "
+        "Haar-random pose; mean ± standard deviation (median).",
+        "",
+        "```",
+        HEADER,
+        *(row.row() for row in rows),
+        "```",
+        "",
+    ]
+    for title, card in cards.items():
+        for name in ("model", "encoder", "training", "samples"):
+            values = ", ".join(f"{k} {v}" for k, v in card.get(name, {}).items())
+            lines += [f"`{title}`, `{name}`: {values}", ""]
+    return "\n".join(lines)
+
+
 def compare_figure(rows: Sequence[Compared], path: Path) -> None:
     """Median errors against samples, operations and time; a colour for each aligner, the mean over
     the sets where there are several."""
@@ -321,6 +350,7 @@ def add_compare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, default=LangevinConfig.steps, help="of the samplers")
     parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch")
     parser.add_argument("--png", type=Path, metavar="OUT", help="figure")
+    parser.add_argument("--card", type=Path, metavar="OUT", help="model card of one aligner")
     parser.add_argument("--json", action="store_true")
 
 
@@ -332,6 +362,8 @@ def evaluate_compare(arguments: argparse.Namespace) -> None:
     if unused:
         raise IgaDrakeError(f"--weights {unused[0]}=...: not among --aligners {','.join(names)}")
     torch.set_num_threads(arguments.threads)
+    if arguments.card and (len(names) != 1 or names[0] not in PARTS):
+        raise IgaDrakeError(f"--card: of one of {', '.join(PARTS)}, not of {', '.join(names)}")
     rows = []
     if not arguments.json:
         print(HEADER)
@@ -354,3 +386,9 @@ def evaluate_compare(arguments: argparse.Namespace) -> None:
         print(json.dumps([asdict(found) for found in rows], indent=2))
     if arguments.png:
         compare_figure(rows, arguments.png)
+    if arguments.card:
+        weights = arguments.weights[-1][1] if arguments.weights else None
+        cards = {kind_of(part): _card(part, weights, names[0]) for part in PARTS[names[0]]}
+        some = [row for row in rows if row.weights == rows[-1].weights]
+        arguments.card.parent.mkdir(parents=True, exist_ok=True)
+        arguments.card.write_text(model_card(some, cards, arguments.frames), encoding="utf-8")

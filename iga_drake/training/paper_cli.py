@@ -57,7 +57,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch on the CPU")
     parser.add_argument(
-        "--half", type=Path, metavar="OUT", help="afterwards copy the weights in half precision"
+        "--half",
+        type=Path,
+        metavar="OUT",
+        help="afterwards copy the weights, the best where some were chosen, in half precision",
     )
 
 
@@ -102,6 +105,8 @@ def main(arguments: argparse.Namespace) -> int:
         found = ", ".join(f"{k} {v:.2f}" for k, v in errors.items() if k != "step")
         print(f"{name} validation, step {errors['step']}: {found}")
     if arguments.half:
-        write_half(arguments.out / f"{kind_of(part)}.safetensors", arguments.half, part)
+        best = arguments.out / "best.safetensors"
+        last = arguments.out / f"{kind_of(part)}.safetensors"
+        write_half(best if best.is_file() else last, arguments.half, part)
         print(f"written: {arguments.half}")
     return 0

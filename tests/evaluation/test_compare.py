@@ -120,6 +120,14 @@ def test_table_and_figure(tmp_path: Path, capsys) -> None:
     out = capsys.readouterr().out
     assert [line.split()[0] for line in out.splitlines()[1:]] == ["iga-paper", "dfm"]
     assert (np.asarray(Image.open(png))[..., :3] < 200).any(-1).mean() > 0.01
+    card = tmp_path / "card.md"
+    one = ["--aligners", "dirreg", "--weights", f"dirreg={folder}", "--card", str(card)]
+    assert cli.main([*options[:8], *one]) == cli.SUCCESS
+    text = card.read_text(encoding="utf-8")
+    assert "`paper-dirreg`: 0 parameters" in text and "unseen_instances" in text
+    assert "candidates 4" in text and "heads 2" in text
+    assert cli.main([*options[:8], "--card", str(card)]) == cli.BAD_INPUT
+    assert "--card: of one of" in capsys.readouterr().err
     nowhere = ["--aligners", "dfm", "--weights", f"dfm={tmp_path / 'none'}"]
     assert cli.main(["evaluate", "compare", *nowhere]) == cli.BAD_INPUT
     captured = capsys.readouterr()

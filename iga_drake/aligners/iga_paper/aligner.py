@@ -37,17 +37,18 @@ def landed(part: str) -> Path:
 
 
 def found_path(part: str, path: Path | str | None, name: str) -> Path:
-    """A part's checkpoint for the aligner `name`: a file, in a folder of such, or the landed one.
-    Raises `AlignerError` where there is none."""
+    """A part's checkpoint for the aligner `name`: a file, the landed one, or in a folder: of
+    checkpoints, or of trainings by part, the best where one was chosen. Raises `AlignerError`."""
     chosen = Path(path) if path else landed(part)
-    if chosen.is_dir():
-        chosen = chosen / f"{kind_of(part)}.safetensors"
-    if not chosen.is_file():
-        raise AlignerError(
-            f"{name}: no weights of part '{part}' at {chosen}: train them with `iga train paper "
-            f"--part {part} --out DIR` and give the file or its folder"
-        )
-    return chosen
+    file = f"{kind_of(part)}.safetensors"
+    places = [chosen / file, chosen / part / "best.safetensors", chosen / part / file]
+    for place in places if chosen.is_dir() else [chosen]:
+        if place.is_file():
+            return place
+    raise AlignerError(
+        f"{name}: no weights of part '{part}' at {chosen}: train them with `iga train paper "
+        f"--part {part} --out DIR/{part}` and give DIR"
+    )
 
 
 def found_model(part: str, path: Path | str | None, name: str) -> PaperModel:

@@ -155,6 +155,12 @@ def test_weights_by_name(tmp_path: Path) -> None:
         make_aligner("dfm", weights=tmp_path / "elsewhere")
     with pytest.raises(CheckpointError, match="kind 'paper-dfm'"):
         make_aligner("dirreg", weights=folder / "paper-dfm.safetensors")
+    trainings = tmp_path / "trainings"
+    for name in ("paper-dirreg", "best"):
+        path = trainings / "dirreg" / f"{name}.safetensors"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes((folder / "paper-dirreg.safetensors").read_bytes())
+        assert paper_aligner.found_path("dirreg", trainings, "dirreg") == path
     one = make_aligner("dirreg", weights=folder).align(context, grasped, target)
     two = DirRegAligner(load_model(folder / "paper-dirreg.safetensors", "dirreg")[0]).align(
         context, grasped, target
