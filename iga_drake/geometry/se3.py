@@ -1,6 +1,7 @@
 """Rotations and rigid motions, batched, in PyTorch. Matrices act on column vectors; metres, rad."""
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -97,12 +98,31 @@ def transform(X: Tensor, points: Tensor) -> Tensor:
     return points @ X[..., :3, :3].transpose(-1, -2) + X[..., None, :3, 3]
 
 
+class _NearestRotation(torch.autograd.Function):
+    """Its derivative is that of the polar factor, bounded where singular values coincide: the
+    SVD's own is not."""
+
+    @staticmethod
+    def forward(ctx: Any, matrix: Tensor) -> Tensor:
+        U, s, Vt = torch.linalg.svd(matrix)
+        flip = torch.ones_like(s)
+        flip[..., 2] = torch.sign(torch.linalg.det(U @ Vt))
+        U, s = U * flip[..., None, :], s * flip
+        ctx.save_for_backward(U, s, Vt)
+        return U @ Vt
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        U, s, Vt = ctx.saved_tensors
+        A = U.transpose(-1, -2) @ gradients[0] @ Vt.transpose(-1, -2)
+        total = s[..., :, None] + s[..., None, :]
+        A = (A - A.transpose(-1, -2)) / torch.where(total.abs() < 1e-12, torch.inf, total)
+        return U @ A @ Vt
+
+
 def nearest_rotation(matrix: Tensor) -> Tensor:
     """The rotation nearest to (..., 3, 3) in the Frobenius norm (SVD with determinant fixed)."""
-    U, _, Vt = torch.linalg.svd(matrix)
-    flip = torch.ones_like(matrix[..., 0])
-    flip[..., 2] = torch.sign(torch.linalg.det(U @ Vt))
-    return (U * flip[..., None, :]) @ Vt
+    return _NearestRotation.apply(matrix)
 
 
 def kabsch(source: Tensor, destination: Tensor, weights: Tensor | None = None) -> Tensor:

@@ -75,3 +75,13 @@ def test_kabsch_never_reflects() -> None:
     mirrored = source * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
     determinant = torch.linalg.det(se3.kabsch(source, mirrored)[:, :3, :3])
     torch.testing.assert_close(determinant, torch.ones(20, dtype=torch.float64))
+
+
+def test_the_derivative_of_the_nearest_rotation() -> None:
+    """Against finite differences; also where singular values coincide, where the SVD's fails."""
+    generator = torch.Generator().manual_seed(0)
+    matrices = torch.randn(6, 3, 3, generator=generator, dtype=torch.float64)
+    R = se3.random_rotations(2, generator=generator)
+    matrices = torch.cat((matrices, 2 * R, -R @ torch.diag(torch.tensor([1.0, 2.0, 3.0])).to(R)))
+    matrices = matrices.requires_grad_()
+    assert torch.autograd.gradcheck(se3.nearest_rotation, (matrices,), eps=1e-7, atol=1e-5)

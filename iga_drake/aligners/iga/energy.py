@@ -32,9 +32,9 @@ LARGE = 30.0  # the least log weight: of what is not there
 class EnergyConfig:
     """Sizes of the network and of the problems it is given; saved with the weights."""
 
-    parts: int = 16  # of each object
-    pairs: int = 128  # that are kept of all
-    combinations: int = 12  # of hypotheses, of each demonstration
+    parts: int = 32  # of each object
+    pairs: int = 384  # that are kept of all
+    combinations: int = 4  # of hypotheses, of each demonstration
     hidden: int = 48
     # Whether the network sees how the transported geometry spreads over the demonstrations.
     spread: bool = True
