@@ -185,7 +185,7 @@ def evaluate_stabilisers(arguments: argparse.Namespace) -> None:
         loss = _last_loss(path.parent)
         results[name] = asdict(found) | {"loss": loss}
         if not arguments.json:
-            print(row(Path(name).stem, part, found, loss), flush=True)
+            print(row(path.parent.name, part, found, loss), flush=True)
     if arguments.json:
         print(json.dumps(results, indent=2))
 
