@@ -73,6 +73,7 @@ def test_training_lowers_the_right_poses(folder: Path) -> None:
             net,
             problems.proposals(k),
             problems.valid(k),
+            problems.voted(k),
             problems.cloud(k),
             config,
             torch.Generator().manual_seed(k),
