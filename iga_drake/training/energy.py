@@ -350,8 +350,8 @@ def train_energy(
         row = run.advance(terms)
         if row and run.ranks.first and run.step % (4 * config.log_every) == 0:
             print(
-                f"step {run.step}: placing {row['placing']:.3f} cm, ranking {row['ranking']:.3f}, truth lower than all wrong poses in "
-                f"{100 * row['truth_is_lower']:.0f} %, "
+                f"step {run.step}: placing {row['placing']:.3f} cm, ranking {row['ranking']:.3f}, "
+                f"truth lower than all wrong poses in {100 * row['truth_is_lower']:.0f} %, "
                 f"{row['samples_per_second']:.1f} problems/s",
                 flush=True,
             )

@@ -103,7 +103,7 @@ def test_demonstrations_of_another_task_are_refused_before_anything_is_built(
 
 
 def test_unknown_aligners_and_options_are_refused(scenario: Scenario):
-    with pytest.raises(AlignerError, match="one of: .*icp, iga"):
+    with pytest.raises(AlignerError, match=r"one of: .*icp, iga"):
         run_episode(scenario, seed=0, aligner="oracle")
     scenario.aligner.name = "icp"
     scenario.aligner.options = {"speed": 3.0}
