@@ -8,9 +8,10 @@ chord, translation at the part):
     E(T) = -tau log sum_k exp((w_k + sum_d log(o_k + sum_c exp(q_kdc - d2_kdc(T) / 2))) / tau)
 
 The weight w_k says how much the task is about the pair, o_k how likely a demonstration shows
-something else, q_kdc how likely a combination of hypotheses is, and d2 has learned widths. A small
-network predicts them from invariants of the matches, their mean and spread over the demonstrations.
-None of it depends on T: a problem is prepared once, and poses are scored by matrix products.
+something else, q_kdc how likely a combination of hypotheses is, and d2 has learned widths; tau grows
+with the number of demonstrations. A small network predicts them from invariants of the matches,
+their mean and spread over the demonstrations. None of it depends on T: a problem is prepared once,
+and poses are scored by matrix products.
 
 Moving the test clouds (or a demonstration) moves `X_kdc` with them, and the features not at all.
 """
@@ -39,8 +40,8 @@ class EnergyConfig:
     # Whether the network sees how the transported geometry spreads over the demonstrations.
     spread: bool = True
     # Widths of the kernel before training.
-    sigma_rotation: float = 0.25  # rad
-    sigma_translation: float = 0.02  # m
+    sigma_rotation: float = 0.15  # rad
+    sigma_translation: float = 0.015  # m
 
 
 FAMILIAR = 12  # figures of a solved problem
@@ -384,10 +385,11 @@ class PairEnergyNet(nn.Module):
         return Energy(
             proposals,
             log_weight=w - proposals.gap.mean(-1),
-            log_outlier=outlier - 6.0,
+            log_outlier=outlier - 3.0,
             log_likely=q,
             precision=precision,
-            temperature=self.log_temperature.exp(),
+            # With D demonstrations, so that a pair's product over them is no narrower than one.
+            temperature=self.log_temperature.exp() * features.shape[1],
         )
 
 
