@@ -303,15 +303,12 @@ def _evaluate_alignment(arguments: argparse.Namespace) -> int:
 
     weights = arguments.weights or default_weights()
     energy = arguments.energy or default_energy()
-    own: dict[str, dict[str, Path]] = {
-        "iga": {"weights": weights, "energy": energy},
-        "iga-vote": {"weights": weights},
-    }
+    own = {name: {"weights": weights, "energy": energy} for name in ("iga", "iga-energy")}
     summaries = []
     if not arguments.json:
         print(HEADER)
     for name in arguments.aligner:
-        options = own.get(name, {})
+        options: dict[str, Path] = own.get(name, {})
         aligner = None if name == ORACLE else make_aligner(name, **options)
         rows = []
         for chosen in arguments.sets or FIVE_SETS:

@@ -18,10 +18,10 @@ def _iga(**options: Any) -> Aligner:
     return IgaAligner(**options)
 
 
-def _iga_vote(**options: Any) -> Aligner:
-    from iga_drake.aligners.iga.aligner import IgaAligner
+def _iga_energy(**options: Any) -> Aligner:
+    from iga_drake.aligners.iga.aligner import IgaAligner, IgaConfig
 
-    return IgaAligner(energy=None, **options)
+    return IgaAligner(config=IgaConfig(ranking="energy"), **options)
 
 
 def _iga_paper(**options: Any) -> Aligner:
@@ -45,7 +45,7 @@ def _dfm(**options: Any) -> Aligner:
 ALIGNERS: dict[str, Callable[..., Aligner]] = {
     "icp": _icp,
     "iga": _iga,
-    "iga-vote": _iga_vote,
+    "iga-energy": _iga_energy,
     "iga-paper": _iga_paper,
     "dirreg": _dirreg,
     "dfm": _dfm,

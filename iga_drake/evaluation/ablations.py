@@ -63,8 +63,9 @@ class AblationError(IgaDrakeError):
 class Setup:
     """All that a variant may change."""
 
-    # What poses come from: "both", the "vote" alone, or the "energy" alone.
-    search: str = "both"
+    # What poses come from: the "vote" alone, "both" (the energy ranks and refines what it and the
+    # vote propose), or the "energy" alone.
+    search: str = "vote"
     aligner: IgaConfig = field(default_factory=IgaConfig)
     voting: VotingConfig = field(default_factory=VotingConfig)
     energy: EnergyConfig = field(default_factory=EnergyConfig)
@@ -102,8 +103,8 @@ class Variant:
 
 
 VARIANTS = (
-    Variant("both", INFERENCE, "default: vote and energy, 96 dense nodes"),
-    Variant("vote-alone", INFERENCE, "vote alone, 32 test nodes vote", {"search": "vote"}),
+    Variant("vote-alone", INFERENCE, "default: vote of 32 test nodes, 96 dense nodes"),
+    Variant("both", INFERENCE, "energy ranks and refines, the vote among it", {"search": "both"}),
     Variant("energy-alone", INFERENCE, "energy's own proposals alone", {"search": "energy"}),
     *(
         Variant(f"nodes-{n}", INFERENCE, f"{n} dense nodes", {"aligner": {"nodes": n}})
@@ -113,31 +114,38 @@ VARIANTS = (
         Variant(
             f"vote-parts-{n}",
             INFERENCE,
-            f"vote alone, {n} test nodes vote",
-            {"search": "vote", "voting": {"parts": n}},
+            f"{n} test nodes vote",
+            {"voting": {"parts": n}},
         )
         for n in (8, 16)
     ),
-    Variant("energy-default", ENERGIES, "default: 16 test nodes, 256 negatives"),
+    Variant("energy-default", ENERGIES, "default: placing, 32 test nodes"),
     Variant("energy-no-spread", ENERGIES, "without spread", {"energy": {"spread": False}}),
     *(
         Variant(
-            f"energy-negatives-{n}",
+            f"energy-ranking-{n}",
             ENERGIES,
-            f"{n} negatives",
-            {"energy_training": {"negatives": n}},
+            f"ranking alone, {n} negatives",
+            {"energy_training": {"placing": 0.0, "ranking": 1.0, "negatives": n}},
         )
-        for n in (64, 1024)
+        for n in (64, 256, 1024)
     ),
     Variant(
         "energy-no-hard-negatives",
         ENERGIES,
-        "without hard negatives",
-        {"energy_training": {"minima": False}},
+        "ranking alone, 256 negatives, none of them hard",
+        {
+            "energy_training": {
+                "placing": 0.0,
+                "ranking": 1.0,
+                "negatives": 256,
+                "minima": False,
+            }
+        },
     ),
     *(
         Variant(f"energy-parts-{n}", ENERGIES, f"{n} test nodes", {"energy": {"parts": n}})
-        for n in (8, 32)
+        for n in (8, 16)
     ),
     Variant("descriptor-default", DESCRIPTORS, "default: local moments"),
     Variant(
@@ -351,9 +359,11 @@ class Ablations:
 
     def _inference(self, setup: Setup, folder: Path, steps: int) -> dict[str, Any]:
         net, _ = load_descriptor(self.weights)
-        energy = self.energy if setup.search == "both" else None
+        energy, config = None, setup.aligner
+        if setup.search == "both":
+            energy, config = self.energy, dataclasses.replace(config, ranking="energy")
         aligner: Aligner
-        aligner = iga = IgaAligner(net, energy=energy, config=setup.aligner, voting=setup.voting)
+        aligner = iga = IgaAligner(net, energy=energy, config=config, voting=setup.voting)
         if setup.search == "energy":
             aligner = EnergyAlone(iga, load_energy(self.energy)[0])
         errors = _errors(aligner, ENERGY_SET, self.count)

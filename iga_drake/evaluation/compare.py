@@ -50,7 +50,7 @@ from iga_drake.training.paper import (
 from iga_drake.training.settings import replaced
 
 PARTS = {"iga-paper": ("rotation", "translation"), "dirreg": ("dirreg",), "dfm": ("dfm",)}
-DESCRIPTORS = ("iga", "iga-vote")  # of their training, that of the descriptors is counted
+DESCRIPTORS = ("iga", "iga-energy")  # of their training, that of the descriptors is counted
 LEARNED = (*DESCRIPTORS, *PARTS)
 COMPARED = ("iga", *PARTS)
 

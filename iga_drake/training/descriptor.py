@@ -35,6 +35,7 @@ WRONG = 3.0  # target sigmas from the true place, from where on a match counts a
 class DescriptorTraining(RunConfig):
     """One training run; saved with the weights. A sample has 2 objects of N instances."""
 
+    optimizer: str = "muon"
     nodes: int = 64
     target_sigma: float = 0.05  # of the canonical size
     visible_within: float = 0.12  # a node counts where a true match is this near

@@ -133,13 +133,13 @@ def test_table_and_figure(tmp_path: Path, capsys) -> None:
     captured = capsys.readouterr()
     assert "no weights of part 'dfm'" in captured.err
     assert cli.main(["evaluate", "compare", "--aligners", "icp"]) == cli.BAD_INPUT
-    assert "iga, iga-vote, iga-paper, dirreg, dfm" in capsys.readouterr().err
+    assert "iga, iga-energy, iga-paper, dirreg, dfm" in capsys.readouterr().err
     assert cli.main([*options[:8], "--aligners", "dirreg", "--weights", f"dfm={folder}"]) == 2
     assert "--weights dfm" in capsys.readouterr().err
 
 
 def test_operations_of_the_default(capsys) -> None:
-    options = ["--aligners", "iga-vote", "--count", "1", "--json"]
+    options = ["--aligners", "iga-energy", "--count", "1", "--json"]
     assert cli.main(["evaluate", "compare", *options]) == cli.SUCCESS
     (row,) = json.loads(capsys.readouterr().out)
     assert row["samples_seen"] > 1000 and row["flops"] > 1e6 * row["samples_seen"]

@@ -23,6 +23,7 @@ from iga_drake.geometry.se3 import rigid
 from iga_drake.paths import models_dir
 
 LANDED = "landed"
+RANKINGS = ("vote", "energy")
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,8 @@ class IgaConfig:
     points: int = 512
     # Nodes with descriptors per object.
     nodes: int = 96
+    # What places and ranks the poses: the vote's agreement, or the learned energy.
+    ranking: str = "vote"
     # Modes below this share of the best one's probability are left out.
     minimum_probability: float = 0.01
 
@@ -69,10 +72,10 @@ def default_energy() -> Path:
 
 
 class IgaAligner:
-    """`Aligner` by dense SE(3)-invariant correspondence, consistency voting, and the learned
-    factorised energy that ranks and refines what they propose.
+    """`Aligner` by dense SE(3)-invariant correspondence and consistency voting.
 
-    Without an energy (`iga-vote`) the vote's own agreement takes its place.
+    The learned factorised energy tells how familiar the objects look. It can also refine and rank
+    what the vote proposes (`IgaConfig.ranking`); measured, that is no better than the vote.
     """
 
     def __init__(
@@ -86,7 +89,7 @@ class IgaAligner:
         search: SearchConfig | None = None,
     ):
         """Takes a network, or reads `weights` (default: the landed checkpoint); likewise `energy`
-        (None: voting alone).
+        (None: voting alone, and no familiarity).
 
         The networks themselves are left as they are. Raises `CheckpointError` (`checkpoint`) for a
         missing or foreign file.
@@ -95,16 +98,20 @@ class IgaAligner:
 
         if net is None:
             net, _ = load_descriptor(Path(weights) if weights else default_weights())
-        if energy == LANDED and not default_energy().is_file():  # TEMPORARY
-            energy = None
         if isinstance(energy, (str, Path)):
             energy, _ = load_energy(default_energy() if energy == LANDED else Path(energy))
-        self.name = "iga" if energy is not None else "iga-vote"
         self._energy = copy.deepcopy(energy).eval().double() if energy is not None else None
         # Double precision where it counts: choices between near ties must not depend on the clouds'
         # frames.
         self._net = copy.deepcopy(net).eval().mixed_precision()
         self.config = config or IgaConfig()
+        if self.config.ranking not in RANKINGS:
+            raise AlignerError(
+                f"iga: ranking '{self.config.ranking}', must be one of: {', '.join(RANKINGS)}"
+            )
+        if self.config.ranking == "energy" and energy is None:
+            raise AlignerError("iga: ranking 'energy' needs an energy: name its weights")
+        self.name = "iga" if self.config.ranking == "vote" else "iga-energy"
         self.voting = voting or VotingConfig()
         self.search = search or SearchConfig()
 
@@ -190,8 +197,9 @@ class IgaAligner:
             prepared = self._energy(
                 pair_proposals(A, B, test[0], test[1], self._energy.config, self.voting)
             )
-            X, energies = minimise(prepared, also=voted, config=self.search)
-            energy, pair_weights = prepared, prepared.pair_weights
+            if self.config.ranking == "energy":
+                X, energies = minimise(prepared, also=voted, config=self.search)
+                energy, pair_weights = prepared, prepared.pair_weights
             familiarity = float(self._energy.familiarity(prepared, X[0]))
         ranked = time.perf_counter()
         probability = (-(energies - energies.min())).softmax(0).numpy()

@@ -8,10 +8,10 @@ chord, translation at the part):
     E(T) = -tau log sum_k exp((w_k + sum_d log(o_k + sum_c exp(q_kdc - d2_kdc(T) / 2))) / tau)
 
 The weight w_k says how much the task is about the pair, o_k how likely a demonstration shows
-something else, q_kdc how likely a combination of hypotheses is, and d2 has learned widths; tau grows
-with the number of demonstrations. A small network predicts them from invariants of the matches,
-their mean and spread over the demonstrations. None of it depends on T: a problem is prepared once,
-and poses are scored by matrix products.
+something else, q_kdc how likely a combination of hypotheses is, and d2 has learned widths; tau
+grows with the number of demonstrations. A small network predicts them from invariants of the
+matches, their mean and spread over the demonstrations. None of it depends on T: a problem is
+prepared once, and poses are scored by matrix products.
 
 Moving the test clouds (or a demonstration) moves `X_kdc` with them, and the features not at all.
 """
