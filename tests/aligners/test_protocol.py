@@ -39,7 +39,7 @@ def test_an_estimate_needs_poses_of_one_length() -> None:
 
 
 def test_an_unknown_aligner_lists_the_known_ones() -> None:
-    with pytest.raises(AlignerError, match="dfm, dirreg, icp, iga, iga-paper"):
+    with pytest.raises(AlignerError, match="dfm, dirreg, icp, iga, iga-energy, iga-paper"):
         make_aligner("magic")
 
 
