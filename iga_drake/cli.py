@@ -8,7 +8,6 @@ import argparse
 import importlib
 import json
 import logging
-import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -16,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from iga_drake.errors import IgaDrakeError
+from iga_drake.paths import write_text
 
 SUCCESS, FAILURE, BAD_INPUT = 0, 1, 2
-ALIGNERS = ("icp", "iga", "iga-paper", "dirreg", "dfm", "expert")
+ALIGNERS = ("icp", "iga", "iga-energy", "iga-paper", "dirreg", "dfm", "expert")
 
 
 class CommandError(IgaDrakeError):
@@ -37,17 +37,6 @@ def scenario_path(text: str) -> Path:
         return named
     known = ", ".join(sorted(p.stem for p in diagrams_dir().glob("*.yaml")))
     raise CommandError(f"scenario {text}: no such file; name a YAML file or one of: {known}")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes under a temporary name and renames, so that nobody sees half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _seed(text: str) -> int:

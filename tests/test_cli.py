@@ -128,15 +128,6 @@ def test_scenarios_can_be_named():
     assert cli.scenario_path("stack.yaml") == diagrams_dir() / "stack.yaml"
 
 
-def test_text_is_written_whole_or_not_at_all(tmp_path: Path):
-    path = tmp_path / "new" / "file.txt"
-    cli.write_text(path, "old")
-    with pytest.raises(UnicodeEncodeError):
-        cli.write_text(path, "half \ud800")
-    assert path.read_text() == "old"
-    assert [p.name for p in path.parent.iterdir()] == ["file.txt"]
-
-
 def test_exit_status_follows_the_verdict(monkeypatch, tmp_path: Path):
     from iga_drake.tasks import episode
 

@@ -199,5 +199,5 @@ def test_the_command_prints_a_table(
     assert out.count("1.25 (  1.25)") == 3 * 9 and "64 negatives" in out
     assert evaluate_ablations(parser.parse_args([*options, "--json"])) == 0
     rows = json.loads(capsys.readouterr().out)
-    assert rows[-1]["name"] == "energy-parts-32"
+    assert rows[-1]["name"] == "energy-parts-16"
     assert rows[-1]["conditions"]["problems"] == 600 and rows[-1]["conditions"]["steps"] == 7
