@@ -123,7 +123,7 @@ def test_the_oracle_answers_without_an_aligner() -> None:
 
 
 def test_bad_arguments_are_refused() -> None:
-    with pytest.raises(IgaDrakeError, match="one of: train, .*validation"):
+    with pytest.raises(IgaDrakeError, match=r"one of: train, .*validation"):
         evaluate_alignment(_Fixed(np.eye(4)), "seen", 1)
     with pytest.raises(IgaDrakeError, match="count 0"):
         evaluate_alignment(_Fixed(np.eye(4)), "validation", 0)
