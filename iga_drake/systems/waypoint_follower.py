@@ -32,9 +32,6 @@ class WaypointFollowerConfig:
     # The measured pose counts as reached within these (m, rad).
     position_tolerance: float = 0.003
     rotation_tolerance: float = math.radians(1.5)
-    # Time (s) at the end of a way after which the arm, still not there, plans anew from where it
-    # is.
-    replan_after: float = 4.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -55,7 +52,6 @@ class _Motion:
     progress_rate: float = 0.0  # 1/s
     opening: float | None = None  # m
     time_reached: float | None = None  # s
-    time_ended: float | None = None  # s, when the desired pose came to the target
     force_start: np.ndarray | None = None  # N, where the target has a contact force
     touched: bool = False
     status: FollowerStatus = field(default_factory=FollowerStatus)
@@ -87,8 +83,7 @@ class WaypointFollower(LeafSystem):
       linear and angular speed stay within their limits and both motions end together.
     - `pose_measured` (RigidTransform): X_WE.
     - `position_measured` (N, rad): the arm's joints. If it is connected and a `solver` was given,
-      a straight line that the arm can't follow is replaced by a path through the joints; an arm
-      that doesn't get to a target plans anew from where it is, every `replan_after` seconds.
+      a straight line that the arm can't follow is replaced by a path through the joints.
     - `force_measured` (3, N in W): external force on the hand. Targets with a `contact_force` need
       it: once it has changed by that much since the motion began, the desired pose stays at the
       measured one and the target counts as reached.
@@ -147,9 +142,6 @@ class WaypointFollower(LeafSystem):
             motion.target is None or target.sequence != motion.target.sequence
         ):
             motion = self._start(context, motion, self._check(target), desired, X_WE)
-        elif self._is_stuck(motion, context.get_time()):
-            assert motion.target is not None
-            motion = self._start(context, motion, motion.target, X_WE, X_WE)
         if self._meets_contact(context, motion):
             motion = replace(motion, touched=True, time_reached=context.get_time(), X_WDesired=X_WE)
         if motion.target is None:
@@ -188,20 +180,8 @@ class WaypointFollower(LeafSystem):
             progress=0.0,
             progress_rate=0.0,
             time_reached=None,
-            time_ended=None,
             force_start=self._read_force(context, target),
             touched=False,
-        )
-
-    def _is_stuck(self, motion: _Motion, time: float) -> bool:
-        """Whether the arm, led to the target some time ago, hasn't got there: a limit or a link is
-        in the way of the line, which another way may avoid."""
-        return (
-            self._solver is not None
-            and motion.time_ended is not None
-            and motion.time_reached is None
-            and not motion.touched
-            and time - motion.time_ended > self._config.replan_after
         )
 
     def _read_force(self, context: Context, target: EndEffectorTarget) -> np.ndarray | None:
@@ -289,7 +269,6 @@ class WaypointFollower(LeafSystem):
             progress_rate=rate,
             opening=target.opening_moving if time_reached is None else target.opening_reached,
             time_reached=time_reached,
-            time_ended=time if progress >= 1.0 and motion.time_ended is None else motion.time_ended,
             status=FollowerStatus(
                 sequence_reached=finished,
                 position_error=position_error,
