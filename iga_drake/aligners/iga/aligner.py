@@ -75,7 +75,7 @@ class IgaAligner:
     """`Aligner` by dense SE(3)-invariant correspondence and consistency voting.
 
     The learned factorised energy tells how familiar the objects look. It can also refine and rank
-    what the vote proposes (`IgaConfig.ranking`); measured, that is no better than the vote.
+    what the vote proposes (`IgaConfig.ranking`, `iga-energy`).
     """
 
     def __init__(
