@@ -5,12 +5,9 @@ Several processes train together under torchrun:
 """
 
 import argparse
-import dataclasses
-import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 
@@ -18,21 +15,9 @@ from iga_drake.errors import IgaDrakeError
 from iga_drake.training import dif_net, encoder, paper_cli
 from iga_drake.training.descriptor import DescriptorSettings, train_descriptor
 from iga_drake.training.energy import EnergySettings, train_energy
+from iga_drake.training.options import add_run_options, run_options, with_options
 from iga_drake.training.ranks import launched, process_group
-from iga_drake.training.run import RunOptions
-from iga_drake.training.settings import TrainingError, read_settings, replaced
-
-# Options that replace a field of the training's settings.
-FIELDS = {
-    "steps": (int, "of the whole training"),
-    "batch": (int, "samples of a forward pass of one process"),
-    "accumulate": (int, "forward passes of one process in a step"),
-    "learning_rate": (float, "at its highest"),
-    "optimizer": (str, "adamw or muon"),
-    "seed": (int, "of the first weights and of the stream of samples"),
-    "validate_every": (int, "steps between validations by alignment error; 0: never"),
-    "validation_samples": (int, "samples of such a validation"),
-}
+from iga_drake.training.settings import TrainingError
 
 ALONE = {"dif-net": dif_net, "encoder": encoder}  # train in one process
 
@@ -48,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_descriptor(parser: argparse.ArgumentParser) -> None:
-    _add_run(parser)
+    add_run_options(parser)
     parser.add_argument("--float32", action="store_true", help="no bfloat16 autocast")
     parser.add_argument("--compile", action="store_true", help="compile layers (needs g++)")
     parser.add_argument(
@@ -57,65 +42,15 @@ def _add_descriptor(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_energy(parser: argparse.ArgumentParser) -> None:
-    _add_run(parser)
+    add_run_options(parser)
     parser.add_argument("--descriptor", type=Path, help="weights that match (default: the landed)")
     parser.add_argument(
         "--problems", type=Path, help="folder where problems are kept (default: OUT/problems)"
     )
 
 
-def _add_run(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, required=True, help="folder of weights, state and log")
-    parser.add_argument("--config", type=Path, help="YAML file with sections of settings")
-    for name, (kind, text) in FIELDS.items():
-        parser.add_argument(f"--{name.replace('_', '-')}", type=kind, help=text)
-    parser.add_argument("--minutes", type=float, default=math.inf, help="stop after this long")
-    parser.add_argument(
-        "--checkpoint-every",
-        type=int,
-        default=RunOptions.checkpoint_every,
-        metavar="STEPS",
-        help="steps between checkpoints",
-    )
-    parser.add_argument(
-        "--checkpoint-minutes",
-        type=float,
-        default=RunOptions.checkpoint_minutes,
-        metavar="MINUTES",
-        help="at most this long between checkpoints",
-    )
-    parser.add_argument("--tensorboard", action="store_true", help="TensorBoard log, too")
-    parser.add_argument("--workers", type=int, default=0, help="processes that make samples")
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch on the CPU")
-
-
-Settings = TypeVar("Settings", DescriptorSettings, EnergySettings)
-
-
-def _settings(arguments: argparse.Namespace, settings: Settings) -> Settings:
-    """Those given (of the run to resume, or defaults); then the file's; then the options'."""
-    if arguments.config:
-        sections = read_settings(arguments.config, vars(settings))
-        settings = type(settings)(**sections)
-    chosen = {k: getattr(arguments, k) for k in FIELDS if getattr(arguments, k) is not None}
-    if getattr(arguments, "float32", False):
-        chosen["bf16"] = False
-    return dataclasses.replace(settings, training=replaced(settings.training, chosen, "options"))
-
-
-def _options(arguments: argparse.Namespace) -> RunOptions:
-    return RunOptions(
-        minutes=arguments.minutes,
-        checkpoint_every=arguments.checkpoint_every,
-        checkpoint_minutes=arguments.checkpoint_minutes,
-        tensorboard=arguments.tensorboard,
-        compile=getattr(arguments, "compile", False),
-    )
-
-
 def _train_energy(arguments: argparse.Namespace) -> int:
-    settings = _settings(arguments, EnergySettings.of(arguments.out))
+    settings: EnergySettings = with_options(EnergySettings.of(arguments.out), arguments)
     with process_group(arguments.device) as device:
         card = train_energy(
             arguments.out,
@@ -125,7 +60,7 @@ def _train_energy(arguments: argparse.Namespace) -> int:
             problems=arguments.problems,
             device=device,
             workers=arguments.workers,
-            options=_options(arguments),
+            options=run_options(arguments),
         )
     if "validation" in card:
         scores = card["validation"]
@@ -153,7 +88,7 @@ def main(arguments: argparse.Namespace) -> int:
         return paper_cli.main(arguments)
     if arguments.network == "energy":
         return _train_energy(arguments)
-    settings = _settings(arguments, DescriptorSettings.of(arguments.out))
+    settings: DescriptorSettings = with_options(DescriptorSettings.of(arguments.out), arguments)
     with process_group(arguments.device) as device:
         card = train_descriptor(
             arguments.out,
@@ -163,7 +98,7 @@ def main(arguments: argparse.Namespace) -> int:
             device=device,
             initial=arguments.initial,
             workers=arguments.workers,
-            options=_options(arguments),
+            options=run_options(arguments),
         )
     if "validation" in card:
         scores = card["validation"]

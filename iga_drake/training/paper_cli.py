@@ -2,28 +2,21 @@
 
 import argparse
 import dataclasses
-import math
 from pathlib import Path
 
 import torch
 
 from iga_drake.aligners.iga_paper.graph import SIZES
 from iga_drake.aligners.iga_paper.model import OUTPUTS, kind_of, write_half
+from iga_drake.training.options import FIELDS as OPTIONS
+from iga_drake.training.options import add_run_options, run_options, with_options
 from iga_drake.training.paper import PaperSettings, default_model, train_paper
 from iga_drake.training.ranks import process_group
-from iga_drake.training.run import RunOptions, SavedState
-from iga_drake.training.settings import read_settings, replaced
+from iga_drake.training.run import SavedState
 
-# Options that replace a field of the training's settings.
-FIELDS = {
-    "steps": (int, "of the whole training"),
-    "batch": (int, "samples of a forward pass of one process"),
-    "accumulate": (int, "forward passes of one process in a step"),
+FIELDS = OPTIONS | {
     "candidates": (int, "counter-examples of a sample"),
     "subset": (int, "train on the first so many samples alone (0: all)"),
-    "learning_rate": (float, "at its highest"),
-    "seed": (int, "of the first weights and of the stream of samples"),
-    "validate_every": (int, "steps between validations by alignment error; 0: never"),
 }
 
 
@@ -31,31 +24,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga train paper`."""
     parser.description = __doc__
     parser.add_argument("--part", choices=OUTPUTS, required=True, help="what to train")
-    parser.add_argument("--out", type=Path, required=True, help="folder of weights, state and log")
+    add_run_options(parser, FIELDS)
     parser.add_argument(
         "--size", choices=SIZES, default="full", help="of the graph network (default: the paper's)"
     )
-    parser.add_argument(
-        "--config", type=Path, help="YAML file with fields of model, training and samples"
-    )
-    for name, (kind, text) in FIELDS.items():
-        parser.add_argument(f"--{name.replace('_', '-')}", type=kind, help=text)
     parser.add_argument("--encoder", type=Path, help="local encoder (default: the landed one)")
     parser.add_argument(
         "--initial", type=Path, help="start from these weights, as after training on a subset"
     )
-    parser.add_argument("--minutes", type=float, default=math.inf, help="stop after this long")
-    parser.add_argument(
-        "--checkpoint-every",
-        type=int,
-        default=RunOptions.checkpoint_every,
-        metavar="STEPS",
-        help="steps between checkpoints",
-    )
-    parser.add_argument("--tensorboard", action="store_true", help="TensorBoard log, too")
-    parser.add_argument("--workers", type=int, default=0, help="processes that make samples")
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch on the CPU")
     parser.add_argument(
         "--half",
         type=Path,
@@ -70,10 +46,7 @@ def settings_of(arguments: argparse.Namespace) -> PaperSettings:
     settings = PaperSettings.of(folder, part)
     if SavedState.read(folder, kind_of(part)) is None:
         settings = dataclasses.replace(settings, model=default_model(part, arguments.size))
-    if arguments.config:
-        settings = PaperSettings(**read_settings(arguments.config, vars(settings)))
-    chosen = {k: getattr(arguments, k) for k in FIELDS if getattr(arguments, k) is not None}
-    return dataclasses.replace(settings, training=replaced(settings.training, chosen, "options"))
+    return with_options(settings, arguments, FIELDS)
 
 
 def main(arguments: argparse.Namespace) -> int:
@@ -92,11 +65,7 @@ def main(arguments: argparse.Namespace) -> int:
             initial=arguments.initial,
             device=device,
             workers=arguments.workers,
-            options=RunOptions(
-                minutes=arguments.minutes,
-                checkpoint_every=arguments.checkpoint_every,
-                tensorboard=arguments.tensorboard,
-            ),
+            options=run_options(arguments),
         )
     print(
         f"{part}: step {card['step']}, {card['samples_seen']} samples seen, {card['seconds']:.0f} s"
