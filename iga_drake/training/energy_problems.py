@@ -23,7 +23,7 @@ from iga_drake.dataset.foreign import foreign_points, foreign_sample
 from iga_drake.dataset.loader import sample_loader
 from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.dataset.splits import sample_set
-from iga_drake.geometry.se3 import rigid
+from iga_drake.geometry.se3 import rigid, so3_exp
 
 KIND = "energy-problems"
 SHARD = 50  # problems a file
@@ -190,8 +190,6 @@ def displacement(X: Tensor, valid: Tensor, cloud: Tensor) -> Tensor:
 def random_near(X: Tensor, generator: torch.Generator, count: int) -> Tensor:
     """(count, 4, 4): poses around X (4, 4), by log-uniform turns of 1 to 45 degrees about their own
     origin and shifts of 2 mm to 10 cm."""
-    from iga_drake.geometry.se3 import so3_exp
-
     def steps(low: float, high: float) -> Tensor:
         direction = torch.randn(count, 3, generator=generator)
         size = torch.rand(count, 1, generator=generator) * np.log(high / low) + np.log(low)
