@@ -190,6 +190,7 @@ def displacement(X: Tensor, valid: Tensor, cloud: Tensor) -> Tensor:
 def random_near(X: Tensor, generator: torch.Generator, count: int) -> Tensor:
     """(count, 4, 4): poses around X (4, 4), by log-uniform turns of 1 to 45 degrees about their own
     origin and shifts of 2 mm to 10 cm."""
+
     def steps(low: float, high: float) -> Tensor:
         direction = torch.randn(count, 3, generator=generator)
         size = torch.rand(count, 1, generator=generator) * np.log(high / low) + np.log(low)
