@@ -158,7 +158,7 @@ def can_follow(robot: PlanningRobot, q: np.ndarray, path: LinePath) -> bool:
     limits = robot.limits
     distance, angle = pose_error(path.X_WStart, path.X_WGoal)
     # A long way or a wide turn that brushes a joint's limit ends folded against it more often than
-    # not; a short one is better kept straight.
+    # not, the other joints going on without it; a short one is better kept straight.
     long = distance > _LONG[0] or angle > _LONG[1]
     margin = _MARGIN_LONG if long else _MARGIN
     lower, upper = limits.position_lower() + margin, limits.position_upper() - margin
@@ -166,6 +166,8 @@ def can_follow(robot: PlanningRobot, q: np.ndarray, path: LinePath) -> bool:
     for step in range(1, count + 1):
         moved = _move_to(robot, q, path.pose(step / count), lower, upper, path.nominal)
         if moved is None or np.abs(moved - q).max() > _JUMP or not _is_clear(robot, moved):
+            return False
+        if long and ((moved <= lower) | (moved >= upper)).any():
             return False
         q = moved
     return True

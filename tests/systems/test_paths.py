@@ -3,7 +3,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from control_fixtures import downward, panda_robot, panda_solver
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from iga_drake.systems.paths import (
     JointPath,
@@ -103,3 +104,18 @@ def test_a_wide_turn_whose_short_way_ends_at_a_limit_goes_through_the_joints():
     for share in np.linspace(0, 1, 21):
         posture = path.posture(share)
         assert (posture > lower).all() and (posture < upper).all()
+
+
+def test_a_line_on_which_a_joint_would_be_held_at_its_limit_goes_through_the_joints():
+    """A turn of 2.2 rad leads q7 to its limit; the rest of the line would fold the arm."""
+    robot, solver = panda_robot(), panda_solver()
+    q = np.array([0.0, -0.378, 0.0, -2.228, 0.0, 1.851, -0.785])
+    axis = np.array([0.046, -0.047, 0.998])
+    turn = RotationMatrix(AngleAxis(2.21, axis / np.linalg.norm(axis)))
+    X_WStart = robot.pose(q)
+    X_WGoal = RigidTransform(turn @ X_WStart.rotation(), [0.665, -0.181, 0.186])
+    line = LinePath(X_WStart, X_WGoal, solver.solve(X_WGoal, near=q), q)
+    assert not can_follow(robot, q, line)
+    path = plan_path(solver, q=q, X_WStart=X_WStart, X_WGoal=X_WGoal)
+    assert isinstance(path, JointPath)
+    assert max(pose_error(path.pose(1.0), X_WGoal)) < 2e-3
