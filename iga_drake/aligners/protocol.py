@@ -34,6 +34,12 @@ def check_cloud(cloud: np.ndarray, name: str, minimum: int = 16) -> np.ndarray:
         raise AlignerError(
             f"{name}: {len(array)} points, at least {minimum} are needed: is the object in view?"
         )
+    distinct = len(np.unique(array, axis=0))
+    if distinct < minimum:
+        raise AlignerError(
+            f"{name}: {len(array)} points of which {distinct} are distinct, at least {minimum} are "
+            "needed: is the object in view?"
+        )
     return array
 
 

@@ -32,7 +32,7 @@ class IgaConfig:
 
     # Points of a cloud that are used (drawn without repetition where there are more).
     points: int = 512
-    # Nodes with descriptors per object.
+    # Nodes with descriptors per object; at most the distinct points of the smallest cloud.
     nodes: int = 96
     # What places and ranks the poses: the vote's agreement, or the learned energy.
     ranking: str = "vote"
@@ -169,7 +169,9 @@ class IgaAligner:
             torch.stack(each)
             for each in zip(*(self._prepare(cloud, seed) for cloud in clouds), strict=True)
         )
-        chosen = furthest_point_sampling(points, self.config.nodes)
+        # A node that is there twice has no neighbourhood: small clouds have fewer.
+        distinct = min(len(np.unique(cloud.numpy(), axis=0)) for cloud in points)
+        chosen = furthest_point_sampling(points, min(self.config.nodes, distinct))
         nodes = torch.gather(points, 1, chosen[..., None].expand(-1, -1, 3))
         index = torch.gather(drawn, 1, chosen).unflatten(0, (2, half))
         found = logits(index) if logits else self._logits(points, chosen)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from iga_drake.aligners.icp import IcpAligner
-from iga_drake.aligners.iga.aligner import IgaAligner
-from iga_drake.aligners.protocol import Alignment
+from iga_drake.aligners.iga.aligner import IgaAligner, IgaConfig
+from iga_drake.aligners.protocol import AlignerError, Alignment
 from iga_drake.dataset.alignment_error import pose_errors, random_pose
 from iga_drake.dataset.samples import make_sample
 from iga_drake.evaluation.alignment import evaluate_alignment
@@ -48,6 +48,23 @@ def test_moving_the_clouds_moves_the_answer(aligner: IgaAligner, count: int) -> 
     expected = G_B @ plain.poses[0] @ np.linalg.inv(G_A)
     shift, angle = pose_errors(moved.poses[0], expected, _move(G_A, A))
     assert shift < 2e-3 and angle < 0.02
+
+
+@pytest.mark.parametrize("ranking", ["vote", "energy"])
+@pytest.mark.parametrize("distinct", [16, 40, 90])
+def test_repeated_points_add_nothing(ranking: str, distinct: int) -> None:
+    """Clouds of few points, however often repeated, as renderings of thin objects are."""
+    context, A, B = _problem(2)
+    few = IgaAligner(config=IgaConfig(ranking=ranking))
+    thin = A[:distinct]
+    once = few.align(context, thin, B)
+    for repeated in (np.tile(thin, (3, 1)), np.repeat(thin, 5, 0)):
+        estimate = few.align(context, repeated, B)
+        assert np.isfinite(estimate.poses).all()
+        shift, angle = pose_errors(estimate.poses[0], once.poses[0], thin)
+        assert shift < 0.03 and angle < 0.5
+    with pytest.raises(AlignerError, match="48 points of which 12 are distinct"):
+        few.align(context, np.tile(A[:12], (4, 1)), B)
 
 
 def test_estimates_are_proper_poses_with_probabilities(aligner: IgaAligner) -> None:
