@@ -14,8 +14,12 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from iga_drake.aligners.iga.descriptor import VectorLinear
-from iga_drake.aligners.iga.vector_neurons import EPSILON, Invariants, VectorLayer
+from iga_drake.aligners.iga.vector_neurons import (
+    EPSILON,
+    Invariants,
+    VectorLayer,
+    VectorLinear,
+)
 from iga_drake.checkpoint import CheckpointError, load_checkpoint
 from iga_drake.geometry.clouds import furthest_point_sampling
 
