@@ -79,6 +79,9 @@ class PaperTraining(RunConfig):
     langevin_every: int = 5
     langevin_steps: int = 5
     langevin_share: float = 0.5
+    # Of the local ones this share stays wide (the paper: none), so that what was learned far away
+    # is not unlearned.
+    wide_share: float = 0.0
     # Stabilisers; 0 leaves one out. Spectral normalisation is a field of the model.
     energy_penalty: float = 1e-3  # on the mean square of the energies
     gradient_penalty: float = 1e-2  # on the mean square of the gradient by A-B edges
@@ -101,6 +104,9 @@ class PaperTraining(RunConfig):
         for name in ("candidates", "penalty_poses", "validation_particles"):
             if getattr(self, name) < 1:
                 raise TrainingError(f"{name} = {getattr(self, name)}, must be at least 1")
+        for name in ("langevin_share", "wide_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise TrainingError(f"{name} = {getattr(self, name)}, must be from 0 to 1")
         for name in ("subset", "langevin_every", "energy_penalty", "gradient_penalty"):
             if getattr(self, name) < 0:
                 raise TrainingError(f"{name} = {getattr(self, name)}, must not be below 0")
@@ -274,7 +280,10 @@ def candidates(
         return R, place[:, None] + t
 
     wide = step < config.wide_steps
-    R, t = around(M, wide)
+    far = M if wide else round(config.wide_share * M)
+    R, t = (
+        torch.cat(both, 1) for both in zip(around(M - far, False), around(far, True), strict=True)
+    )
     every = config.langevin_every
     if not wide and every and step % every == 0:
         moving = round(config.langevin_share * M)

@@ -96,6 +96,16 @@ def test_the_first_candidate_is_right_and_parts_keep_to_themselves(part: str) ->
             assert 0.95 * most < shift.max() <= most + 1e-6
 
 
+@pytest.mark.parametrize("share", [0.0, 0.25])
+def test_a_share_of_the_local_candidates_stays_wide(share: float) -> None:
+    model, asked = _model("translation"), drawn_problem(nodes(2, 2, 4), _generator())
+    config = _config(wide_steps=0, candidates=400, langevin_every=0, wide_share=share)
+    _, t = candidates(model, asked, config, 7, _generator())
+    far = ((t - t[:, :1]).abs().amax(-1) > config.local_translation + 1e-6).float().mean(1)
+    # Of the wide ones (1/8)^3 fall into the local cube.
+    assert (far - share).abs().max() < 0.01
+
+
 def test_langevin_candidates_come_at_their_steps_and_have_lower_energies() -> None:
     model, asked = _model("translation"), drawn_problem(nodes(2, 2, 4), _generator())
     config = _config(wide_steps=0, langevin_every=5, langevin_steps=6, candidates=64)
