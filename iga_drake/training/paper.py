@@ -79,8 +79,7 @@ class PaperTraining(RunConfig):
     langevin_every: int = 5
     langevin_steps: int = 5
     langevin_share: float = 0.5
-    # Of the local ones this share stays wide (the paper: none), so that what was learned far away
-    # is not unlearned.
+    # Of the local ones this share stays wide (the paper: none).
     wide_share: float = 0.0
     # Stabilisers; 0 leaves one out. Spectral normalisation is a field of the model.
     energy_penalty: float = 1e-3  # on the mean square of the energies
