@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from iga_drake.checkpoint import load_checkpoint, save_checkpoint
 from iga_drake.training.log import TrainingLog, resident_memory
+from iga_drake.training.muon import Muon
 from iga_drake.training.ranks import Ranks
 from iga_drake.training.settings import TrainingError
 
@@ -117,7 +118,7 @@ def make_optimizers(
         return [torch.optim.AdamW(parameters, lr=rate, weight_decay=decay, betas=BETAS)]
     matrices = [p for p in parameters if p.ndim == 2]
     others = [p for p in parameters if p.ndim != 2]
-    muon = torch.optim.Muon(matrices, lr=rate, weight_decay=decay, adjust_lr_fn="match_rms_adamw")
+    muon = Muon(matrices, lr=rate, weight_decay=decay)
     return [muon, torch.optim.AdamW(others, lr=rate, weight_decay=decay, betas=BETAS)]
 
 
