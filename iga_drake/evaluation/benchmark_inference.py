@@ -1,5 +1,5 @@
-"""`iga benchmark inference`: time to infer one waypoint, learned aligner beside ICP in the same
-run."""
+"""`iga benchmark inference`: time to infer one waypoint, the default aligner beside a peer in the
+same run: ICP, or the paper's sampler (100 particles, 70 steps for each network)."""
 
 import argparse
 import json
@@ -8,6 +8,10 @@ import time
 import numpy as np
 import torch
 
+from iga_drake.aligners.iga.local_encoder import EncoderConfig
+from iga_drake.aligners.iga_paper.aligner import IgaPaperAligner
+from iga_drake.aligners.iga_paper.graph import SIZES, GraphConfig
+from iga_drake.aligners.iga_paper.model import PaperModel
 from iga_drake.aligners.protocol import Aligner, Alignment
 from iga_drake.aligners.registry import make_aligner
 from iga_drake.dataset.samples import make_sample
@@ -18,8 +22,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the benchmark."""
     parser.add_argument("--count", type=int, default=10, help="waypoints inferred (default 10)")
     parser.add_argument("--demonstrations", type=int, default=4, choices=range(1, 5))
+    parser.add_argument("--against", choices=("icp", "iga-paper"), default="icp", help="the peer")
+    parser.add_argument(
+        "--size", choices=SIZES, default="full",
+        help="of iga-paper's networks, here untrained, which costs no less (default: the paper's)",
+    )  # fmt: skip
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--json", action="store_true")
+
+
+def _untrained_paper(size: str) -> Aligner:
+    config = GraphConfig.of_size(size)
+    models = [PaperModel(part, config, EncoderConfig()) for part in ("rotation", "translation")]
+    return IgaPaperAligner([model.eval().requires_grad_(False) for model in models])
 
 
 def _times(aligner: Aligner, count: int, demonstrations: int) -> np.ndarray:
@@ -42,17 +57,20 @@ def main(arguments: argparse.Namespace) -> int:
             raise IgaDrakeError(f"--{name} {getattr(arguments, name)}: at least 1 is needed")
     torch.set_num_threads(arguments.threads)
     result: dict[str, dict[str, float]] = {}
-    for name in ("iga", "icp"):
-        seconds = _times(make_aligner(name), arguments.count, arguments.demonstrations)
+    peer, count = arguments.against, arguments.count
+    for name in ("iga", peer):
+        paper = name == "iga-paper"
+        aligner = _untrained_paper(arguments.size) if paper else make_aligner(name)
+        seconds = _times(aligner, count, arguments.demonstrations)
         result[name] = {
             "median_s": float(np.median(seconds)),
             "min_s": float(seconds.min()),
             "max_s": float(seconds.max()),
         }
-    ratio = result["iga"]["median_s"] / result["icp"]["median_s"]
+    ratio = result[peer]["median_s"] / result["iga"]["median_s"]
     if arguments.json:
         settings = {k: getattr(arguments, k) for k in ("count", "demonstrations", "threads")}
-        print(json.dumps({**settings, **result, "ratio_iga_to_icp": ratio}))
+        print(json.dumps({**settings, **result, f"ratio_{peer}_to_iga": ratio}))
         return 0
     print(
         f"one waypoint, {arguments.demonstrations} demonstrations, {arguments.count} problems, "
@@ -60,7 +78,7 @@ def main(arguments: argparse.Namespace) -> int:
     )
     for name, row in result.items():
         print(
-            f"  {name:<4} {row['median_s']:.3f} s median ({row['min_s']:.3f} to {row['max_s']:.3f})"
+            f"  {name:<9} {row['median_s']:.3f} s median ({row['min_s']:.3f} to {row['max_s']:.3f})"
         )
-    print(f"  iga / icp: {ratio:.2f}")
+    print(f"  {peer} / iga: {ratio:.2f}")
     return 0

@@ -45,6 +45,7 @@ from iga_drake.training.paper import (
     common_turns,
     energy_loss,
     nodes_of,
+    taken,
     variant_loss,
 )
 from iga_drake.training.settings import replaced
@@ -194,14 +195,15 @@ def trained(name: str, weights: Path | None, *, particles: int, steps: int) -> T
         chosen = dataclasses.replace(descent(), particles=particles, steps=steps)
         made = DfmAligner(models[0], config=DfmConfig(langevin=chosen))
     per_sample = [paper_flops(m, c) for m, c in zip(models, cards, strict=True)]
-    seen = [card["samples_seen"] for card in cards]
+    told = [taken(card) for card in cards]
+    seen = [each["samples_seen"] for each in told]
     return Trained(
         name,
         str(weights or "landed"),
         made,
         max(seen),
         float(np.dot(per_sample, seen)),
-        float(sum(card["seconds"] for card in cards)),
+        float(sum(each["seconds"] for each in told)),
     )
 
 
@@ -265,16 +267,18 @@ def model_card(rows: Sequence[Compared], cards: dict[str, dict], frames: str) ->
     lines = ["# " + ", ".join(cards), ""]
     for title, card in cards.items():
         seed, commit = card["training"].get("seed", 0), card.get("commit") or "unknown"
+        told = taken(card)
         lines += [
             f"`{title}`: {card.get('parameters', 0):,} parameters with the encoder, "
-            f"{card['step']:,} steps, {card['samples_seen']:,} samples seen in "
-            f"{card['seconds'] / 60:.0f} minutes, seed {seed}, commit {commit}.",
+            f"{told['step']:,} steps, {told['samples_seen']:,} samples seen in "
+            f"{told['seconds'] / 60:.0f} minutes, seed {seed}, commit {commit}; settings below are "
+            f"those of the last {card['step']:,} steps.",
             "",
         ]
-    told = "each in a frame of its own" if frames == "own" else "all targets turned alike"
+    turned = "each in a frame of its own" if frames == "own" else "all targets turned alike"
     lines += [
-        f"Errors modulo symmetry: four demonstrations, {told}; the test pair's grasped cloud at a "
-        "Haar-random pose; mean ± standard deviation (median).",
+        f"Errors modulo symmetry: four demonstrations, {turned}; the test pair's grasped cloud at "
+        "a Haar-random pose; mean ± standard deviation (median).",
         "",
         "```",
         HEADER,

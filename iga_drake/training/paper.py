@@ -49,6 +49,7 @@ from iga_drake.training.settings import TrainingError, replaced
 SEED_STRIDE = 10_000_000  # samples between the streams of two seeds
 FRAMES = ("own", "common")
 ENERGIES = ("rotation", "translation")
+NOTHING = {"step": 0, "samples_seen": 0, "seconds": 0.0}  # taken before a training
 SPREAD = 0.3  # m, half the width of the cube where translations start in validation
 
 
@@ -520,9 +521,11 @@ def train_paper(
         net = PaperModel(part, model, EncoderConfig(**saved.card["encoder"])).to(device)
     else:
         net = _new_model(part, model, encoder).to(device)
-        if initial is not None:
-            _take_over(net, initial, part)
     description = net.description()
+    if saved is not None:
+        description |= {"before": saved.card.get("before", NOTHING)}
+    elif initial is not None:
+        description |= {"before": _take_over(net, initial, part)}
     run = TrainingRun(
         output,
         kind_of(part),
@@ -557,15 +560,23 @@ def train_paper(
     return card
 
 
-def _take_over(net: PaperModel, path: Path, part: str) -> None:
-    """Weights from a checkpoint of the same part. Raises `CheckpointError`."""
-    tensors, _ = load_checkpoint(path, kind=kind_of(part))
+def taken(card: dict) -> dict:
+    """Steps, samples and seconds of a training, with those of the weights that it began with."""
+    before = card.get("before", NOTHING)
+    return {name: card[name] + before[name] for name in NOTHING}
+
+
+def _take_over(net: PaperModel, path: Path, part: str) -> dict:
+    """Weights from a checkpoint of the same part; returns what they have `taken`. Raises
+    `CheckpointError`."""
+    tensors, card = load_checkpoint(path, kind=kind_of(part))
     try:
         net.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
     except RuntimeError as error:
         raise CheckpointError(
             f"{path}: does not fit this network ({error}): start from weights of its sizes"
         ) from error
+    return taken(card)
 
 
 def _summary(row: dict[str, float]) -> str:

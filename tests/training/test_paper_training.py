@@ -29,6 +29,7 @@ from iga_drake.training.paper import (
     moves,
     part_errors,
     right_place,
+    taken,
     train_paper,
     variant_loss,
 )
@@ -307,6 +308,21 @@ def test_a_stopped_run_goes_on_to_the_same_weights(encoder: Path, tmp_path: Path
     trained = load_checkpoint(encoder, kind="encoder")[0]
     kept = states[0]["net.encoder.embed.weight"]
     assert torch.equal(kept, trained["encoder.embed.weight"])
+
+
+def test_what_came_before_counts(encoder: Path, tmp_path: Path) -> None:
+    weights = tmp_path / "first" / "paper-translation.safetensors"
+    options = {"model": SMALL, "samples": SAMPLES, "encoder": encoder}
+    for name, initial, steps in (("first", None, [3]), ("second", weights, [2, 4])):
+        for stop_at in steps:
+            card = train_paper(
+                tmp_path / name, "translation", config=_config(steps=5), initial=initial,
+                options=RunOptions(stop_at=stop_at), **options,
+            )  # fmt: skip
+    assert card["step"] == 4 and card["samples_seen"] == 8
+    all_of_it = taken(card)
+    assert all_of_it["step"] == 7 and all_of_it["samples_seen"] == 14
+    assert all_of_it["seconds"] > card["seconds"]
 
 
 def test_validation_chooses_a_checkpoint_and_options_say_no(
