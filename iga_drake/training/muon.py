@@ -39,9 +39,7 @@ class Muon(torch.optim.Optimizer):
         super().__init__(params, {"lr": lr, "weight_decay": weight_decay})
         for parameter in self._parameters():
             if parameter.ndim != 2:
-                raise ValueError(
-                    f"Muon: a parameter of shape {tuple(parameter.shape)}, no matrix"
-                )
+                raise ValueError(f"Muon: a parameter of shape {tuple(parameter.shape)}, no matrix")
 
     def _parameters(self) -> list[nn.Parameter]:
         return [parameter for group in self.param_groups for parameter in group["params"]]
