@@ -82,6 +82,8 @@ class PaperTraining(RunConfig):
     langevin_share: float = 0.5
     # Of the local ones this share stays wide (the paper: none).
     wide_share: float = 0.0
+    # So many of them (0: all) carry the gradient, drawn as likely as exp(-E): its mean is the same.
+    drawn: int = 0
     # Stabilisers; 0 leaves one out. Spectral normalisation is a field of the model.
     energy_penalty: float = 1e-3  # on the mean square of the energies
     gradient_penalty: float = 1e-2  # on the mean square of the gradient by A-B edges
@@ -107,7 +109,7 @@ class PaperTraining(RunConfig):
         for name in ("langevin_share", "wide_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise TrainingError(f"{name} = {getattr(self, name)}, must be from 0 to 1")
-        for name in ("subset", "langevin_every", "energy_penalty", "gradient_penalty"):
+        for name in ("subset", "drawn", "langevin_every", "energy_penalty", "gradient_penalty"):
             if getattr(self, name) < 0:
                 raise TrainingError(f"{name} = {getattr(self, name)}, must not be below 0")
         if self.validation_split not in sample_sets():
@@ -310,14 +312,30 @@ def energy_loss(
     R, t = candidates(model, asked, config, step, generator)
     with torch.autocast(R.device.type, torch.bfloat16, enabled=config.bf16):
         context = asked.context(model.graph)
-        E = model.graph(context, R, t)[..., 0].float()  # (S, 1 + M)
+        with torch.set_grad_enabled(not config.drawn):
+            E = model.graph(context, R, t)[..., 0].float()  # (S, 1 + M)
+        if config.drawn:
+            # The loss's gradient is that of the right pose's energy less the mean over all with the
+            # probabilities that the energies give them.
+            chosen = torch.multinomial(
+                (-E).softmax(1), config.drawn, replacement=True, generator=generator
+            )
+            chosen = torch.cat((torch.zeros_like(chosen[:, :1]), chosen), 1)
+            rows = torch.arange(len(E), device=E.device)[:, None]
+            carrying = model.graph(context, R[rows, chosen], t[rows, chosen])[..., 0].float()
         if config.gradient_penalty:
             some = torch.randperm(R.shape[1], generator=generator, device=R.device)
             some = some[: config.penalty_poses]
             edges = model.graph.edges_between(context, R[:, some], t[:, some]).requires_grad_()
             of_some = model.graph(context, R[:, some], t[:, some], edges).float().sum()
     nce = E[:, 0] + (-E).logsumexp(1)
-    total = nce.sum() + config.energy_penalty * E.square().mean(1).sum()
+    if config.drawn:
+        slope = carrying[:, 0] - carrying[:, 1:].mean(1)
+        nce = nce + slope - slope.detach()
+        penalised = carrying[:, 1:]
+    else:
+        penalised = E
+    total = nce.sum() + config.energy_penalty * penalised.square().mean(1).sum()
     statistics = {
         "nce": nce.detach().mean(),
         "energy_min": E.detach().amin(1).mean(),

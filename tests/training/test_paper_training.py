@@ -149,6 +149,27 @@ def test_info_nce_of_known_energies(monkeypatch) -> None:
     assert term.statistics["top1"] == pytest.approx(0.5)
 
 
+def test_drawn_candidates_give_the_same_loss_and_on_average_its_gradient() -> None:
+    model, some = _model("rotation", spectral=False), nodes(2, 3, 4)
+    for linear in model.graph.mlp:  # energies that differ, so that the draws matter
+        linear.weight.data *= 3
+    config = _config(candidates=6, gradient_penalty=0.0, energy_penalty=0.0)
+    weights = [p for p in model.graph.parameters() if p.requires_grad]
+
+    def gradient(**changes) -> tuple[float, torch.Tensor]:
+        chosen = dataclasses.replace(config, **changes)
+        total = energy_loss(model, some, chosen, 0, _generator()).total
+        found = torch.autograd.grad(total, weights, allow_unused=True)
+        return total.item(), torch.cat([g.flatten() for g in found if g is not None])
+
+    value, expected = gradient()
+    again, few = gradient(drawn=2)
+    _, many = gradient(drawn=20_000)
+    assert again == pytest.approx(value, rel=1e-5)
+    off = [(found - expected).norm() / expected.norm() for found in (few, many)]
+    assert off[0] > 0.1 and off[1] < 0.03
+
+
 def test_the_gradient_penalty_makes_edges_matter_less() -> None:
     """A step down its gradient lowers the mean square of dE/de; against finite differences."""
     model, some = _model("translation", spectral=False), nodes(1, 2, 4)
