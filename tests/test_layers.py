@@ -28,7 +28,7 @@ ALLOWED = {
 # The contract between stations and systems: a table without behaviour.
 CONTRACTS = {"iga_drake.station.ports"}
 # Usable by every package.
-ROOT_MODULES = {"iga_drake.checkpoint", "iga_drake.errors", "iga_drake.paths"}
+ROOT_MODULES = {f"iga_drake.{name}" for name in ("checkpoint", "errors", "paths", "precision")}
 WITHOUT_DRAKE = ("geometry", "shapes", "dataset", "aligners", "training")
 
 

@@ -22,6 +22,7 @@ from iga_drake.checkpoint import CheckpointError, load_checkpoint
 from iga_drake.dataset.loader import sample_loader
 from iga_drake.dataset.samples import SampleConfig
 from iga_drake.geometry.clouds import furthest_point_sampling
+from iga_drake.precision import mixed_precision
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
 from iga_drake.training.settings import TrainingError, replaced
 from iga_drake.training.validation import alignment_errors
@@ -86,7 +87,7 @@ def correspondence_loss(
     nodes = furthest_point_sampling(points, config.nodes, start.to(points.device))
     place = torch.gather(canonical, 1, nodes[..., None].expand(-1, -1, 3))
     M = config.nodes
-    with torch.autocast(points.device.type, torch.bfloat16, enabled=config.bf16):
+    with mixed_precision(points.device, config.bf16):
         descriptors = net(points, nodes, group=N)
     descriptors = descriptors.float().reshape(2 * S, N * M, -1)
     place = place.reshape(2 * S, N * M, 3)

@@ -29,6 +29,7 @@ from iga_drake.checkpoint import load_checkpoint, save_checkpoint
 from iga_drake.dataset.loader import Batch, sample_loader
 from iga_drake.dataset.occupancy import OccupancyConfig, make_occupancy_sample
 from iga_drake.geometry.clouds import furthest_point_sampling
+from iga_drake.precision import mixed_precision
 
 # Logits (B, Q) at queries (B, Q, 3) from clouds (B, P, 3) with centres (B, K), by index.
 Predictor = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -142,7 +143,7 @@ def occupancy_loss(
     start = torch.randint(points.shape[1], (len(points),)).to(points.device)
     index = furthest_point_sampling(points, count, start)
     target = (batch["distance"] < shell).float()
-    with torch.autocast(points.device.type, torch.bfloat16, enabled=config.bf16):
+    with mixed_precision(points.device, config.bf16):
         logits = net(points, batch["queries"], index)
     logits = logits.float()
     loss = torch.nn.functional.binary_cross_entropy_with_logits(logits, target)

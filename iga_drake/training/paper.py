@@ -43,6 +43,7 @@ from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.dataset.splits import sample_sets
 from iga_drake.geometry.se3 import geodesic_angle, kabsch, rigid, so3_exp
 from iga_drake.paths import models_dir
+from iga_drake.precision import mixed_precision
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
 from iga_drake.training.settings import TrainingError, replaced
 
@@ -310,7 +311,7 @@ def energy_loss(
     """
     asked = drawn_problem(nodes, generator, turned=config.turned)
     R, t = candidates(model, asked, config, step, generator)
-    with torch.autocast(R.device.type, torch.bfloat16, enabled=config.bf16):
+    with mixed_precision(R.device, config.bf16):
         context = asked.context(model.graph)
         with torch.set_grad_enabled(not config.drawn):
             E = model.graph(context, R, t)[..., 0].float()  # (S, 1 + M)
@@ -369,7 +370,7 @@ def variant_loss(
     else:
         t = place[:, None] + t
     identity = torch.eye(3, device=R.device).expand_as(R)
-    with torch.autocast(R.device.type, torch.bfloat16, enabled=config.bf16):
+    with mixed_precision(R.device, config.bf16):
         context = asked.context(model.graph)
         if model.part == "dirreg":
             found_R, found_t = correction_of(model.graph, context, R, t)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from iga_drake.aligners.iga_paper.graph import Context, GraphNetwork
 from iga_drake.aligners.iga_paper.langevin import Energy, LangevinConfig, haar_rotations, langevin
+from iga_drake.precision import mixed_precision
 
 DISTANCE_UNIT = 0.1  # m, of the translations that networks put out
 
@@ -19,7 +20,7 @@ def energy_of(network: GraphNetwork, context: Context, *, bf16: bool = False) ->
     """The energy that a network trained as one gives poses; `bf16` for mixed precision."""
 
     def energy(R: Tensor, t: Tensor) -> Tensor:
-        with torch.autocast(R.device.type, torch.bfloat16, enabled=bf16):
+        with mixed_precision(R.device, bf16):
             return network(context, R, t)[..., 0].float()
 
     return energy
