@@ -97,6 +97,9 @@ class PaperTraining(RunConfig):
     # "own": every alignment in a frame of its own, as the evaluation sets have them. "common": as
     # in the paper's data, target objects turned alike in all alignments of a sample.
     frames: str = "own"
+    # Which alignment of a sample is the test: any, drawn at every use; or always the last one, as in
+    # the evaluation, which makes a fifth of the problems of a subset.
+    any_test: bool = True
     turned: bool = False  # each sample as a whole, at random at every use: more data than there is
     validation_split: str = "validation"  # set; "train" while it learns a subset of that
     validation_particles: int = 32
@@ -227,14 +230,15 @@ class NodeStream:
         return self._kept[index]
 
 
-def drawn_problem(nodes: Nodes, generator: torch.Generator, *, turned: bool = False) -> Problem:
-    """One of the alignments as the test, the others as demonstrations; `turned` at random, each
-    sample as a whole."""
+def drawn_problem(nodes: Nodes, config: PaperTraining, generator: torch.Generator) -> Problem:
+    """One of the alignments as the test, the others as demonstrations, as `any_test` and `turned`
+    of the training say."""
     S, _, N = nodes.positions.shape[:3]
     device = nodes.positions.device
-    order = torch.randperm(N, generator=generator, device=device)
-    nodes = Nodes(*(part[:, :, order] for part in nodes))
-    if turned:
+    if config.any_test:
+        order = torch.randperm(N, generator=generator, device=device)
+        nodes = Nodes(*(part[:, :, order] for part in nodes))
+    if config.turned:
         R = haar_rotations(S, generator=generator, device=device)
         nodes = _turned(nodes, R[:, None].expand(S, N, 3, 3))
     return problem(nodes)
@@ -309,7 +313,7 @@ def energy_loss(
 
     Statistics: the lowest and the highest energy, the right pose's, how often it is the lowest.
     """
-    asked = drawn_problem(nodes, generator, turned=config.turned)
+    asked = drawn_problem(nodes, config, generator)
     R, t = candidates(model, asked, config, step, generator)
     with mixed_precision(R.device, config.bf16):
         context = asked.context(model.graph)
@@ -356,7 +360,7 @@ def variant_loss(
     model: PaperModel, nodes: Nodes, config: PaperTraining, step: int, generator: torch.Generator
 ) -> Term:
     """Of DirReg or DFM, summed over samples: half of the poses wide, half local."""
-    asked = drawn_problem(nodes, generator, turned=config.turned)
+    asked = drawn_problem(nodes, config, generator)
     place = right_place(asked)
     S, M = len(place), config.candidates
     far = moves(S, M - M // 2, config.wide_rotation, config.wide_translation, generator)

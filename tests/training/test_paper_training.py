@@ -79,7 +79,7 @@ def _generator() -> torch.Generator:
 
 @pytest.mark.parametrize("part", ["rotation", "translation"])
 def test_the_first_candidate_is_right_and_parts_keep_to_themselves(part: str) -> None:
-    model, asked = _model(part), drawn_problem(nodes(2, 2, 4), _generator())
+    model, asked = _model(part), drawn_problem(nodes(2, 2, 4), _config(), _generator())
     for step, wide in ((0, True), (7, False)):
         config = _config(wide_steps=5, candidates=400, langevin_every=0)
         R, t = candidates(model, asked, config, step, _generator())
@@ -100,7 +100,7 @@ def test_the_first_candidate_is_right_and_parts_keep_to_themselves(part: str) ->
 
 @pytest.mark.parametrize("share", [0.0, 0.25])
 def test_a_share_of_the_local_candidates_stays_wide(share: float) -> None:
-    model, asked = _model("translation"), drawn_problem(nodes(2, 2, 4), _generator())
+    model, asked = _model("translation"), drawn_problem(nodes(2, 2, 4), _config(), _generator())
     config = _config(wide_steps=0, candidates=400, langevin_every=0, wide_share=share)
     _, t = candidates(model, asked, config, 7, _generator())
     far = ((t - t[:, :1]).abs().amax(-1) > config.local_translation + 1e-6).float().mean(1)
@@ -109,7 +109,7 @@ def test_a_share_of_the_local_candidates_stays_wide(share: float) -> None:
 
 
 def test_langevin_candidates_come_at_their_steps_and_have_lower_energies() -> None:
-    model, asked = _model("translation"), drawn_problem(nodes(2, 2, 4), _generator())
+    model, asked = _model("translation"), drawn_problem(nodes(2, 2, 4), _config(), _generator())
     config = _config(wide_steps=0, langevin_every=5, langevin_steps=6, candidates=64)
     without = dataclasses.replace(config, langevin_steps=0)
     found, before = (candidates(model, asked, c, 5, _generator())[1] for c in (config, without))
@@ -201,7 +201,7 @@ def test_variants_are_right_where_they_say_the_truth(monkeypatch) -> None:
     for part in ("dirreg", "dfm"):
         model, config = _model(part), _config(candidates=8)
         some = nodes(2, 2, 4)
-        place = right_place(drawn_problem(some, _generator()))
+        place = right_place(drawn_problem(some, _config(), _generator()))
 
         def correction(network, context, R, t, place=place):
             return torch.eye(3).expand_as(R), place[:, None].expand_as(t)
@@ -280,12 +280,15 @@ def test_a_subset_comes_round_and_any_alignment_can_be_the_test() -> None:
     every = NodeStream(model, _config(batch=2), SAMPLES, **options)
     torch.testing.assert_close(next(every).positions, seen[:2])
     some = Nodes(*(part[:1] for part in next(stream)))
-    tests = set()
-    for seed in range(12):
-        asked = drawn_problem(some, torch.Generator().manual_seed(seed))
-        size = asked.test[0].positions.square().sum().item()
-        tests.add(round(size, 7))
-    assert len(tests) == 5
+    tests: dict[bool, set[float]] = {True: set(), False: set()}
+    for any_test, found in tests.items():
+        for seed in range(12):
+            chosen = dataclasses.replace(config, any_test=any_test)
+            asked = drawn_problem(some, chosen, torch.Generator().manual_seed(seed))
+            found.add(round(asked.test[0].positions.square().sum().item(), 7))
+    assert len(tests[True]) == 5
+    last = problem(some).test[0].positions.square().sum().item()
+    assert tests[False] == {round(last, 7)}
 
 
 # Trainings
