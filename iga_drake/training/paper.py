@@ -97,8 +97,8 @@ class PaperTraining(RunConfig):
     # "own": every alignment in a frame of its own, as the evaluation sets have them. "common": as
     # in the paper's data, target objects turned alike in all alignments of a sample.
     frames: str = "own"
-    # Which alignment of a sample is the test: any, drawn at every use; or always the last one, as in
-    # the evaluation, which makes a fifth of the problems of a subset.
+    # Which alignment of a sample is the test: any, drawn at every use; or always the last one, as
+    # in the evaluation, which makes a fifth of the problems of a subset.
     any_test: bool = True
     turned: bool = False  # each sample as a whole, at random at every use: more data than there is
     validation_split: str = "validation"  # set; "train" while it learns a subset of that
