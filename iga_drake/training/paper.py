@@ -83,7 +83,8 @@ class PaperTraining(RunConfig):
     langevin_share: float = 0.5
     # Of the local ones this share stays wide (the paper: none).
     wide_share: float = 0.0
-    # So many of them (0: all) carry the gradient, drawn as likely as exp(-E): its mean is the same.
+    # Of energies: so many poses (0: all), drawn as likely as exp(-E), carry the gradient. Its mean is
+    # that of all; the energy penalty is then on those.
     drawn: int = 0
     # Stabilisers; 0 leaves one out. Spectral normalisation is a field of the model.
     energy_penalty: float = 1e-3  # on the mean square of the energies
@@ -319,15 +320,12 @@ def energy_loss(
         context = asked.context(model.graph)
         with torch.set_grad_enabled(not config.drawn):
             E = model.graph(context, R, t)[..., 0].float()  # (S, 1 + M)
+        carrying = E
         if config.drawn:
-            # The loss's gradient is that of the right pose's energy less the mean over all with the
-            # probabilities that the energies give them.
-            chosen = torch.multinomial(
-                (-E).softmax(1), config.drawn, replacement=True, generator=generator
-            )
-            chosen = torch.cat((torch.zeros_like(chosen[:, :1]), chosen), 1)
+            drawn = (-E).softmax(1).multinomial(config.drawn, replacement=True, generator=generator)
+            drawn = torch.cat((torch.zeros_like(drawn[:, :1]), drawn), 1)
             rows = torch.arange(len(E), device=E.device)[:, None]
-            carrying = model.graph(context, R[rows, chosen], t[rows, chosen])[..., 0].float()
+            carrying = model.graph(context, R[rows, drawn], t[rows, drawn])[..., 0].float()
         if config.gradient_penalty:
             some = torch.randperm(R.shape[1], generator=generator, device=R.device)
             some = some[: config.penalty_poses]
@@ -335,12 +333,11 @@ def energy_loss(
             of_some = model.graph(context, R[:, some], t[:, some], edges).float().sum()
     nce = E[:, 0] + (-E).logsumexp(1)
     if config.drawn:
+        # The gradient is that of the right pose's energy less the mean over all poses with the
+        # probabilities that the energies give them.
         slope = carrying[:, 0] - carrying[:, 1:].mean(1)
         nce = nce + slope - slope.detach()
-        penalised = carrying[:, 1:]
-    else:
-        penalised = E
-    total = nce.sum() + config.energy_penalty * penalised.square().mean(1).sum()
+    total = nce.sum() + config.energy_penalty * carrying.square().mean(1).sum()
     statistics = {
         "nce": nce.detach().mean(),
         "energy_min": E.detach().amin(1).mean(),
