@@ -83,8 +83,8 @@ class PaperTraining(RunConfig):
     langevin_share: float = 0.5
     # Of the local ones this share stays wide (the paper: none).
     wide_share: float = 0.0
-    # Of energies: so many poses (0: all), drawn as likely as exp(-E), carry the gradient. Its mean is
-    # that of all; the energy penalty is then on those.
+    # Of energies: so many poses (0: all), drawn as likely as exp(-E), carry the gradient. Its mean
+    # is that of all; the energy penalty is then on those.
     drawn: int = 0
     # Stabilisers; 0 leaves one out. Spectral normalisation is a field of the model.
     energy_penalty: float = 1e-3  # on the mean square of the energies
