@@ -153,7 +153,7 @@ def add_stabilisers(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, default=400, help="of each training")
     parser.add_argument("--subset", type=int, default=50, help="samples trained on, over and over")
     parser.add_argument("--candidates", type=int, default=64)
-    parser.add_argument("--accumulate", type=int, default=2, help="samples of a step")
+    parser.add_argument("--batch", type=int, default=2, help="samples of a step")
     parser.add_argument("--frames", choices=("own", "common"), default="common")
     parser.add_argument("--ablations", default=",".join(ABLATIONS), help="which, comma-separated")
     parser.add_argument("--minutes", type=float, default=math.inf, help="of each training")
@@ -168,14 +168,14 @@ def evaluate_stabilisers(arguments: argparse.Namespace) -> None:
         raise IgaDrakeError("stabilisers: name trained networks (--weights) or a folder (--out)")
     networks: dict[str, Path] = {str(path): path for path in arguments.weights}
     results = {}
-    if not arguments.json:
-        print(HEADER)
     for name in arguments.ablations.split(",") if arguments.out else ():
         model, config = ablated(name, GraphConfig.of_size(arguments.size), _training(arguments))
         folder = arguments.out / name
         options = RunOptions(minutes=arguments.minutes)
         train_paper(folder, part, model=model, config=config, options=options)
         networks[name] = folder / f"{kind_of(part)}.safetensors"
+    if not arguments.json:
+        print(HEADER)
     for name, path in networks.items():
         net, card = load_model(path, part)
         config = PaperTraining(
@@ -195,11 +195,15 @@ def _training(arguments: argparse.Namespace) -> PaperTraining:
         steps=arguments.steps,
         subset=arguments.subset,
         candidates=arguments.candidates,
-        accumulate=arguments.accumulate,
+        batch=arguments.batch,
+        accumulate=1,
         frames=arguments.frames,
+        any_test=False,
+        optimizer="muon",
+        learning_rate=2e-3,
         warmup=20,
         ema=0.99,
-        wide_steps=arguments.steps // 2,
+        wide_steps=arguments.steps // 4,
     )
 
 
