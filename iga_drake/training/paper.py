@@ -12,6 +12,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -318,7 +319,7 @@ def energy_loss(
     R, t = candidates(model, asked, config, step, generator)
     with mixed_precision(R.device, config.bf16):
         context = asked.context(model.graph)
-        with torch.set_grad_enabled(not config.drawn):
+        with torch.no_grad() if config.drawn else nullcontext():
             E = model.graph(context, R, t)[..., 0].float()  # (S, 1 + M)
         carrying = E
         if config.drawn:
