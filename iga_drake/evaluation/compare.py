@@ -4,6 +4,7 @@ training operations and inference time."""
 import argparse
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -314,8 +315,11 @@ def compare_figure(rows: Sequence[Compared], path: Path) -> None:
                     points.append((float(np.mean([getattr(r, key) for r in some])), float(y)))
                 points.sort()
                 panel.plot(*zip(*points, strict=True), "o-", color=f"C{color}", ms=5, label=name)
-            if all(float(getattr(row, key)) > 0 for row in rows):
+            values = [float(getattr(row, key)) for row in rows]
+            if min(values) > 0:  # whole decades, which have labels that don't run into each other
                 panel.set_xscale("log")
+                decades = math.floor(math.log10(min(values))), math.ceil(math.log10(max(values)))
+                panel.set_xlim(10.0 ** decades[0], 10.0 ** max(decades[1], decades[0] + 1))
             panel.set_ylim(bottom=0)
             panel.set_xlabel(label)
             panel.set_ylabel(f"median {kind} error ({unit})")
