@@ -65,7 +65,9 @@ class Trained:
     weights: str
     aligner: Aligner
     samples_seen: int  # by each of its networks
-    flops: float  # of the whole training, matrix products forward and backward
+    # Of the whole training, matrix products forward and backward; what came before the last leg of a
+    # training at that leg's operations for each sample.
+    flops: float
     seconds: float  # of the whole training, on whatever machine it ran
 
 
