@@ -65,8 +65,8 @@ class Trained:
     weights: str
     aligner: Aligner
     samples_seen: int  # by each of its networks
-    # Of the whole training, matrix products forward and backward; what came before the last leg of a
-    # training at that leg's operations for each sample.
+    # Of the whole training, matrix products forward and backward; what came before the last leg of
+    # a training at that leg's operations for each sample.
     flops: float
     seconds: float  # of the whole training, on whatever machine it ran
 
