@@ -542,11 +542,10 @@ def train_paper(
         net = PaperModel(part, model, EncoderConfig(**saved.card["encoder"])).to(device)
     else:
         net = _new_model(part, model, encoder).to(device)
-    description = net.description()
-    if saved is not None:
-        description |= {"before": saved.card.get("before", NOTHING)}
-    elif initial is not None:
-        description |= {"before": _take_over(net, initial, part)}
+    taken_before = saved.card.get("before", NOTHING) if saved is not None else NOTHING
+    if saved is None and initial is not None:
+        taken_before = _take_over(net, initial, part)
+    description = net.description() | {"before": taken_before}
     run = TrainingRun(
         output,
         kind_of(part),
@@ -560,16 +559,18 @@ def train_paper(
         ),
     )
     ranks = run.ranks
+    # Neither the samples that the first weights have seen come again, nor the draws made on them.
+    seen = int(taken_before["samples_seen"])
     stream = NodeStream(
         net, config, samples,
-        first=config.seed * SEED_STRIDE + run.samples_seen,
+        first=config.seed * SEED_STRIDE + seen + run.samples_seen,
         rank=ranks.rank, world=ranks.world, workers=workers, device=device,
     )  # fmt: skip
     loss = energy_loss if part in ENERGIES else variant_loss
     while run.goes_on():
         net.graph.power_iteration()
         first = run.step * config.accumulate
-        numbers = [(first + k) * ranks.world + ranks.rank for k in range(config.accumulate)]
+        numbers = [seen + (first + k) * ranks.world + ranks.rank for k in range(config.accumulate)]
         row = run.advance(
             loss(net, next(stream), config, run.step, _generator(config, number, device))
             for number in numbers

@@ -340,19 +340,34 @@ def test_a_stopped_run_goes_on_to_the_same_weights(encoder: Path, tmp_path: Path
     assert torch.equal(kept, trained["encoder.embed.weight"])
 
 
-def test_what_came_before_counts(encoder: Path, tmp_path: Path) -> None:
+def test_what_came_before_counts(encoder: Path, tmp_path: Path, monkeypatch) -> None:
+    """It is counted, and neither its samples nor its draws come again."""
+    samples_used, draws = [], []
+    make, generator = paper.NodeStream._of_subset, paper._generator
+
+    def remember(self, index: int) -> Nodes:
+        samples_used.append(index)
+        return make(self, index)
+
+    def recorded(config, number: int, device):
+        draws.append(number)
+        return generator(config, number, device)
+
+    monkeypatch.setattr(paper.NodeStream, "_of_subset", remember)
+    monkeypatch.setattr(paper, "_generator", recorded)
     weights = tmp_path / "first" / "paper-translation.safetensors"
     options = {"model": SMALL, "samples": SAMPLES, "encoder": encoder}
     for name, initial, steps in (("first", None, [3]), ("second", weights, [2, 4])):
         for stop_at in steps:
             card = train_paper(
-                tmp_path / name, "translation", config=_config(steps=5), initial=initial,
+                tmp_path / name, "translation", config=_config(steps=5, subset=20), initial=initial,
                 options=RunOptions(stop_at=stop_at), **options,
             )  # fmt: skip
     assert card["step"] == 4 and card["samples_seen"] == 8
     all_of_it = taken(card)
     assert all_of_it["step"] == 7 and all_of_it["samples_seen"] == 14
     assert all_of_it["seconds"] > card["seconds"]
+    assert samples_used == list(range(14)) and len(set(draws)) == len(draws)
 
 
 def test_validation_chooses_a_checkpoint_and_options_say_no(
