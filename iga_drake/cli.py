@@ -72,7 +72,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     live = arguments.meshcat or scenario.visualization.meshcat
     meshcat = None
     if live or arguments.html:
-        from iga_drake.station.meshcat import start_meshcat
+        from iga_drake.viewing.meshcat import start_meshcat
 
         meshcat = start_meshcat(scenario.visualization)
         meshcat.StartRecording(set_visualizations_while_recording=live)
@@ -87,7 +87,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
         on_event=lambda line: print(line, flush=True),
     )
     if meshcat is not None:
-        from iga_drake.evaluation.replay import show_prediction, write_html
+        from iga_drake.viewing.replay import show_prediction, write_html
 
         meshcat.StopRecording()
         meshcat.PublishRecording()
@@ -118,7 +118,7 @@ def _add_demonstrate(parser: argparse.ArgumentParser) -> None:
 
 
 def _demonstrate(arguments: argparse.Namespace) -> int:
-    from iga_drake.aligners.demonstration import check_replaceable, write_demonstrations
+    from iga_drake.demonstrations.demonstration import check_replaceable, write_demonstrations
     from iga_drake.station.scenario import load_scenario
     from iga_drake.tasks.episode import record_demonstrations
 
@@ -138,16 +138,16 @@ def _demonstrate(arguments: argparse.Namespace) -> int:
 # what is looked at: module, its function that adds options, its function that shows
 VIEWS = {
     "demonstrations": ("iga_drake.cli", "_add_view_demonstrations", "_view_demonstrations"),
-    "shapes": ("iga_drake.evaluation.shape_sheets", "add_view_shapes", "view_shapes"),
-    "dataset": ("iga_drake.evaluation.dataset_views", "add_view_dataset", "view_dataset"),
+    "shapes": ("iga_drake.viewing.shape_sheets", "add_view_shapes", "view_shapes"),
+    "dataset": ("iga_drake.viewing.dataset_views", "add_view_dataset", "view_dataset"),
     "deformations": (
-        "iga_drake.evaluation.deformations",
+        "iga_drake.studies.deformations",
         "add_view_deformations",
         "view_deformations",
     ),
-    "energy": ("iga_drake.evaluation.energy_views", "add_view_energy", "view_energy"),
+    "energy": ("iga_drake.studies.energy_views", "add_view_energy", "view_energy"),
     "reconstruction": (
-        "iga_drake.evaluation.encoder_views",
+        "iga_drake.studies.encoder_views",
         "add_view_reconstruction",
         "view_reconstruction",
     ),
@@ -182,8 +182,8 @@ def _add_view_demonstrations(parser: argparse.ArgumentParser) -> None:
 
 
 def _view_demonstrations(arguments: argparse.Namespace) -> int:
-    from iga_drake.aligners.demonstration import read_demonstrations
-    from iga_drake.evaluation.replay import demonstrations_html, serve_demonstrations
+    from iga_drake.demonstrations.demonstration import read_demonstrations
+    from iga_drake.viewing.replay import demonstrations_html, serve_demonstrations
 
     demonstrations = read_demonstrations(arguments.folder)
     for index, demonstration in enumerate(demonstrations.demonstrations):
@@ -210,30 +210,30 @@ def _names(text: str) -> list[str]:
 
 # what is evaluated: module, its function that adds options, its function that evaluates
 EVALUATIONS = {
-    "ablations": ("iga_drake.evaluation.ablations", "add_ablations", "evaluate_ablations"),
+    "ablations": ("iga_drake.studies.ablations", "add_ablations", "evaluate_ablations"),
     "tasks": ("iga_drake.cli", "_add_evaluate_tasks", "_evaluate_tasks"),
     "alignment": ("iga_drake.cli", "_add_evaluate_alignment", "_evaluate_alignment"),
     "deformations": (
-        "iga_drake.evaluation.deformations",
+        "iga_drake.studies.deformations",
         "add_evaluate_deformations",
         "evaluate_deformations",
     ),
-    "familiarity": ("iga_drake.evaluation.familiarity", "add_arguments", "main"),
+    "familiarity": ("iga_drake.studies.familiarity", "add_arguments", "main"),
     "diagnosis": (
-        "iga_drake.evaluation.diagnosis",
+        "iga_drake.studies.diagnosis",
         "add_evaluate_diagnosis",
         "evaluate_diagnosis",
     ),
-    "scaling": ("iga_drake.evaluation.scaling", "add_evaluate_scaling", "evaluate_scaling"),
-    "diversity": ("iga_drake.evaluation.scaling", "add_evaluate_diversity", "evaluate_diversity"),
-    "compare": ("iga_drake.evaluation.compare", "add_compare", "evaluate_compare"),
+    "scaling": ("iga_drake.studies.scaling", "add_evaluate_scaling", "evaluate_scaling"),
+    "diversity": ("iga_drake.studies.scaling", "add_evaluate_diversity", "evaluate_diversity"),
+    "compare": ("iga_drake.studies.compare", "add_compare", "evaluate_compare"),
     "stabilisers": (
-        "iga_drake.evaluation.stabilisers",
+        "iga_drake.studies.stabilisers",
         "add_stabilisers",
         "evaluate_stabilisers",
     ),
     "training-log": (
-        "iga_drake.evaluation.training_log",
+        "iga_drake.studies.training_log",
         "add_training_log",
         "evaluate_training_log",
     ),
@@ -384,7 +384,7 @@ def _add_benchmark(parser: argparse.ArgumentParser) -> None:
 
 def _benchmark(arguments: argparse.Namespace) -> int:
     name = arguments.what.replace("-", "_")
-    module = _delegate(f"iga_drake.evaluation.benchmark_{name}")
+    module = _delegate(f"iga_drake.studies.benchmark_{name}")
     return _run_delegate(module, f"iga benchmark {arguments.what}", arguments.options)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from iga_drake.aligners.demonstration import Demonstration, DemonstrationSet
+from iga_drake.demonstrations.demonstration import Demonstration, DemonstrationSet
 
 
 def make_demonstration(seed: int = 0, **changes) -> Demonstration:

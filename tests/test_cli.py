@@ -8,7 +8,7 @@ import pytest
 from demonstration_fakes import make_set
 
 from iga_drake import cli
-from iga_drake.aligners.demonstration import write_demonstrations
+from iga_drake.demonstrations.demonstration import write_demonstrations
 from iga_drake.paths import diagrams_dir
 
 

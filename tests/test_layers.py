@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -11,25 +12,14 @@ import iga_drake
 
 PACKAGE = Path(iga_drake.__file__).parent
 
-# What each package may import from this one, itself aside.
-ALLOWED = {
-    "geometry": set(),
-    "shapes": {"geometry"},
-    "dataset": {"geometry", "shapes"},
-    "aligners": {"geometry"},
-    "training": {"geometry", "shapes", "dataset", "aligners"},
-    "systems": {"geometry", "aligners"},
-    "station": {"geometry", "aligners", "systems"},
-    "tasks": {"geometry", "shapes", "aligners", "systems", "station"},
-    "evaluation": {
-        "geometry", "shapes", "dataset", "aligners", "training", "systems", "station", "tasks",
-    },
-}  # fmt: skip
-# The contract between stations and systems: a table without behaviour.
-CONTRACTS = {"iga_drake.station.ports"}
+# The packages in order of the data's way: each may import from itself and from those before it.
+ORDER = (
+    "geometry", "shapes", "dataset", "demonstrations", "aligners", "training", "planning",
+    "systems", "policy", "viewing", "station", "tasks", "evaluation", "studies",
+)  # fmt: skip
 # Usable by every package.
 ROOT_MODULES = {f"iga_drake.{name}" for name in ("checkpoint", "errors", "paths", "precision")}
-WITHOUT_DRAKE = ("geometry", "shapes", "dataset", "aligners", "training")
+WITHOUT_DRAKE = ORDER[: ORDER.index("planning")]
 
 
 def imported_modules(path: Path) -> set[str]:
@@ -51,23 +41,32 @@ def is_module(name: str) -> bool:
     return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
 
 
-@pytest.mark.parametrize("package", ALLOWED)
+@pytest.mark.parametrize("package", ORDER)
 def test_imports_point_upwards(package: str):
+    allowed = set(ORDER[: ORDER.index(package) + 1])
     wrong = []
     for path in sorted((PACKAGE / package).rglob("*.py")):
         for module in imported_modules(path):
-            parts = module.split(".")
-            if module in ROOT_MODULES | {"iga_drake"} or parts[1] in ALLOWED[package] | {package}:
-                continue
-            if package == "systems" and module in CONTRACTS:
-                continue
-            wrong.append(f"{path.relative_to(PACKAGE)} imports {module}")
+            if module not in ROOT_MODULES | {"iga_drake"} and module.split(".")[1] not in allowed:
+                wrong.append(f"{path.relative_to(PACKAGE)} imports {module}")
     assert not wrong
 
 
-def test_every_package_is_in_the_table():
-    packages = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
-    assert packages == set(ALLOWED)
+def test_every_package_is_in_the_order():
+    assert {path.parent.name for path in PACKAGE.glob("*/__init__.py")} == set(ORDER)
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    """Lazy imports count as well."""
+    graph = {}
+    for path in PACKAGE.rglob("*.py"):
+        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+        name = ".".join(parts).removesuffix(".__init__")
+        graph[name] = imported_modules(path) - {name, "iga_drake"}
+    try:
+        tuple(TopologicalSorter(graph).static_order())
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
 
 
 @pytest.mark.parametrize("package", WITHOUT_DRAKE)

@@ -8,7 +8,8 @@ registrations.
 
 import numpy as np
 
-from iga_drake.aligners.protocol import AlignerError, Alignment, PoseEstimate, check_cloud
+from iga_drake.aligners.protocol import AlignerError, PoseEstimate
+from iga_drake.demonstrations.alignment import Alignment, check_cloud
 
 
 def _open3d():

@@ -12,47 +12,12 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.errors import IgaDrakeError
 
 
 class AlignerError(IgaDrakeError):
-    """An aligner was given clouds or a context that it can't work with."""
-
-
-def check_cloud(cloud: np.ndarray, name: str, minimum: int = 16) -> np.ndarray:
-    """Returns `cloud` as a finite (P, 3) float64 array or raises `AlignerError` naming `name`."""
-    array = np.asarray(cloud, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise AlignerError(f"{name}: expected an array of shape (P, 3), got {array.shape}")
-    if not np.isfinite(array).all():
-        bad = int((~np.isfinite(array)).any(axis=1).sum())
-        raise AlignerError(
-            f"{name}: {bad} of {len(array)} points are not finite: remove invalid depth pixels "
-            "before aligning"
-        )
-    if len(array) < minimum:
-        raise AlignerError(
-            f"{name}: {len(array)} points, at least {minimum} are needed: is the object in view?"
-        )
-    distinct = len(np.unique(array, axis=0))
-    if distinct < minimum:
-        raise AlignerError(
-            f"{name}: {len(array)} points of which {distinct} are distinct, at least {minimum} are "
-            "needed: is the object in view?"
-        )
-    return array
-
-
-@dataclass(frozen=True)
-class Alignment:
-    """Both clouds of one demonstration at one waypoint, in one common frame (metres)."""
-
-    grasped: np.ndarray  # (P, 3)
-    target: np.ndarray  # (Q, 3)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "grasped", check_cloud(self.grasped, "Alignment.grasped"))
-        object.__setattr__(self, "target", check_cloud(self.target, "Alignment.target"))
+    """An aligner was asked for what it doesn't know, or given a context that it can't use."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +61,7 @@ class Aligner(Protocol):
     ) -> PoseEstimate:
         """Aligns `grasped` (P, 3) with `target` (Q, 3) as in `context` (one or more alignments).
 
-        Deterministic for a seed. Raises `AlignerError` for an empty context and for clouds that are
-        empty, not finite or too small.
+        Deterministic for a seed. Raises `AlignerError` for an empty context, and `CloudError`
+        (`demonstrations.alignment`) for clouds that are empty, not finite or too small.
         """
         ...

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iga_drake.aligners.protocol import Alignment, PoseEstimate
+from iga_drake.aligners.protocol import PoseEstimate
+from iga_drake.demonstrations.alignment import Alignment
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,10 @@
 
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
-from iga_drake.station.cameras import camera_info
-from iga_drake.station.ports import Role
 from iga_drake.station.scenario import Scenario
+from iga_drake.station.simulated.cameras import camera_info
 from iga_drake.systems.fusion import PointCloudFusion
+from iga_drake.systems.ports import Role
 
 
 def add_fusion(builder: DiagramBuilder, station: Diagram, scenario: Scenario) -> PointCloudFusion:

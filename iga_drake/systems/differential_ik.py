@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import AffineSystem, BusCreator, DiscreteTimeIntegrator, MatrixGain
 
 from iga_drake.errors import IgaDrakeError
-from iga_drake.systems.planning_robot import PlanningRobot
+from iga_drake.planning.planning_robot import PlanningRobot
 
 _System = DifferentialInverseKinematicsSystem
 _WISH = -0.05  # m or rad

@@ -4,7 +4,7 @@ import numpy as np
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from iga_drake.systems.planning_robot import PlanningRobot
+from iga_drake.planning.planning_robot import PlanningRobot
 
 # Directions in which the arm moves less than this share of its best one carry no force estimate:
 # near a singularity the torques say nothing about them.

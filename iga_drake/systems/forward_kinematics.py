@@ -4,7 +4,7 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem
 
-from iga_drake.systems.planning_robot import PlanningRobot
+from iga_drake.planning.planning_robot import PlanningRobot
 
 
 class ForwardKinematics(LeafSystem):

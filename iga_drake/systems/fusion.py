@@ -12,7 +12,7 @@ from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I
 from scipy.ndimage import binary_dilation
 
 from iga_drake.errors import IgaDrakeError
-from iga_drake.systems.voxels import voxel_cloud
+from iga_drake.geometry.voxels import voxel_cloud
 
 
 class FusionError(IgaDrakeError):

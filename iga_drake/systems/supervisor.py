@@ -7,8 +7,8 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
 from iga_drake.errors import IgaDrakeError
+from iga_drake.planning.planning_robot import PlanningRobot
 from iga_drake.systems.messages import SupervisorStatus
-from iga_drake.systems.planning_robot import PlanningRobot
 
 
 @dataclass(frozen=True)

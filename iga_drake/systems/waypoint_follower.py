@@ -9,9 +9,9 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
 from iga_drake.errors import IgaDrakeError
-from iga_drake.systems.inverse_kinematics import PoseSolver
+from iga_drake.planning.inverse_kinematics import PoseSolver
+from iga_drake.planning.routes import LinePath, Path, plan_path, pose_error
 from iga_drake.systems.messages import EndEffectorTarget, FollowerStatus
-from iga_drake.systems.paths import LinePath, Path, plan_path, pose_error
 
 # Distance (m) or angle (rad) between desired and measured pose from which on the arm counts as not
 # having got there.

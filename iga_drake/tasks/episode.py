@@ -10,19 +10,20 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 
-from iga_drake.aligners.demonstration import (
+from iga_drake.aligners.protocol import Aligner, AlignerError, PoseEstimate
+from iga_drake.aligners.registry import make_aligner
+from iga_drake.demonstrations.alignment import Alignment
+from iga_drake.demonstrations.demonstration import (
     Demonstration,
     DemonstrationSet,
     read_demonstrations,
 )
-from iga_drake.aligners.protocol import Aligner, AlignerError, Alignment, PoseEstimate
-from iga_drake.aligners.registry import make_aligner
 from iga_drake.paths import models_dir
+from iga_drake.policy.motion import Phase, PhaseEntry
 from iga_drake.station.scenario import Scenario
-from iga_drake.systems.policy_sequence import Phase, PhaseEntry
-from iga_drake.tasks.episode_diagram import EpisodeDiagram, build_episode_diagram
 from iga_drake.tasks.pose_error import ROUND_FAMILIES, equivalent_poses, least_pose_error
 from iga_drake.tasks.registry import make_task
+from iga_drake.tasks.robot_diagram import EpisodeDiagram, build_episode_diagram
 from iga_drake.tasks.task import Snapshot, Split, Task, TaskError
 
 EXPERT = "expert"

@@ -3,9 +3,9 @@
 import numpy as np
 from pydrake.math import RigidTransform
 
-from iga_drake.shapes import bowl
+from iga_drake.shapes.families import bowl
 from iga_drake.shapes.surfaces import ShellProfile
-from iga_drake.station.panda import gripper_cloud
+from iga_drake.station.panda.model import gripper_cloud
 
 _GAP = 0.003  # m kept between the hand and the other bowl
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from iga_drake.systems.paths import pose_error
+from iga_drake.planning.routes import pose_error
 
 # Families that are the same turned about their z axis.
 ROUND_FAMILIES = ("bowl",)

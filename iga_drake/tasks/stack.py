@@ -9,12 +9,12 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from scipy.optimize import linprog
 
-from iga_drake.shapes import bowl
+from iga_drake.policy.motion import TaskMotion
+from iga_drake.shapes.families import bowl
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
-from iga_drake.station.panda import HOME_POSITION, add_panda
-from iga_drake.station.scene import Scene, SceneObject
-from iga_drake.systems.policy_sequence import TaskMotion
+from iga_drake.station.panda.model import HOME_POSITION, add_panda
+from iga_drake.station.simulated.scene import Scene, SceneObject
 from iga_drake.tasks.nesting import nesting_height, release_height
 from iga_drake.tasks.task import (
     ROBOT,

@@ -13,10 +13,10 @@ from pydrake.systems.framework import Context
 
 from iga_drake.errors import IgaDrakeError
 from iga_drake.paths import cache_dir
+from iga_drake.policy.motion import TaskMotion
 from iga_drake.shapes.instance import ShapeInstance
-from iga_drake.station.panda import PandaModel
-from iga_drake.station.scene import Scene
-from iga_drake.systems.policy_sequence import TaskMotion
+from iga_drake.station.panda.model import PandaModel
+from iga_drake.station.simulated.scene import Scene
 
 Split = Literal["demonstration", "test"]
 SPLITS: tuple[Split, ...] = ("demonstration", "test")

@@ -4,8 +4,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from iga_drake.aligners.icp import IcpAligner
-from iga_drake.aligners.protocol import Alignment
 from iga_drake.dataset.samples import make_sample
+from iga_drake.demonstrations.alignment import Alignment
 
 
 def test_the_same_objects_moved_are_put_back() -> None:

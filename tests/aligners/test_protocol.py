@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from paper_networks import untrained
 
-from iga_drake.aligners.protocol import AlignerError, Alignment, PoseEstimate, check_cloud
+from iga_drake.aligners.protocol import AlignerError, PoseEstimate
 from iga_drake.aligners.registry import ALIGNERS, make_aligner
+from iga_drake.demonstrations.alignment import Alignment, CloudError, check_cloud
 
 PAPER = ("iga-paper", "dirreg", "dfm")
 CLOUD = np.random.default_rng(0).normal(size=(64, 3)) * 0.05
@@ -22,12 +23,12 @@ CLOUD = np.random.default_rng(0).normal(size=(64, 3)) * 0.05
     ],
 )
 def test_bad_clouds_are_named(cloud: np.ndarray, message: str) -> None:
-    with pytest.raises(AlignerError, match=message):
+    with pytest.raises(CloudError, match=message):
         check_cloud(cloud, "grasped")
 
 
 def test_an_alignment_checks_both_clouds() -> None:
-    with pytest.raises(AlignerError, match=r"Alignment\.target"):
+    with pytest.raises(CloudError, match=r"Alignment\.target"):
         Alignment(CLOUD, CLOUD[:3])
 
 
@@ -51,7 +52,7 @@ def test_every_aligner_refuses_bad_input(name: str, tmp_path: Path) -> None:
     with pytest.raises(AlignerError, match="context is empty"):
         aligner.align((), CLOUD, CLOUD)
     context = (Alignment(CLOUD, CLOUD),)
-    with pytest.raises(AlignerError, match="grasped"):
+    with pytest.raises(CloudError, match="grasped"):
         aligner.align(context, CLOUD[:2], CLOUD)
-    with pytest.raises(AlignerError, match="target"):
+    with pytest.raises(CloudError, match="target"):
         aligner.align(context, CLOUD, np.full((40, 3), np.inf))

@@ -5,7 +5,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from iga_drake.errors import IgaDrakeError
-from iga_drake.station.panda_planning import make_panda_planning_robot
+from iga_drake.station.panda.planning import make_panda_planning_robot
 from iga_drake.systems.differential_ik import DifferentialIk, DifferentialIkConfig
 
 

@@ -3,7 +3,7 @@ from control_fixtures import panda_robot
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
-from iga_drake.station.panda import add_panda
+from iga_drake.station.panda.model import add_panda
 from iga_drake.systems.forward_kinematics import ForwardKinematics
 
 

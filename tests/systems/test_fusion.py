@@ -5,6 +5,7 @@ from pydrake.perception import DepthImageToPointCloud
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I
 from scipy.spatial import KDTree
 
+from iga_drake.geometry.voxels import voxel_cloud
 from iga_drake.systems.fusion import (
     CameraCounts,
     FusionError,
@@ -12,7 +13,6 @@ from iga_drake.systems.fusion import (
     pixel_rays,
     unreliable_pixels,
 )
-from iga_drake.systems.voxels import voxel_cloud
 
 INFO = CameraInfo(160, 120, 150.0, 155.0, 79.5, 59.5)
 SHAPE = (120, 160)

@@ -1,7 +1,7 @@
 import numpy as np
 from pydrake.systems.sensors import ImageLabel16I
 
-from iga_drake.station.ports import Role
+from iga_drake.systems.ports import Role
 from iga_drake.systems.segmentation import Segmentation
 
 

@@ -9,8 +9,8 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from iga_drake.errors import IgaDrakeError
+from iga_drake.planning.routes import pose_error
 from iga_drake.systems.messages import NO_TARGET, EndEffectorTarget
-from iga_drake.systems.paths import pose_error
 from iga_drake.systems.waypoint_follower import WaypointFollower, WaypointFollowerConfig
 
 STEP = 0.005

@@ -13,9 +13,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from iga_drake.station.panda import PandaModel, add_panda
-from iga_drake.station.panda_command import PandaCommand
-from iga_drake.station.scene import Scene
+from iga_drake.station.panda.command import PandaCommand
+from iga_drake.station.panda.model import PandaModel, add_panda
+from iga_drake.station.simulated.scene import Scene
 
 
 class Rest:

@@ -8,11 +8,11 @@ import pytest
 from demonstration_fakes import make_set
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from iga_drake.aligners.demonstration import DemonstrationError, write_demonstrations
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate
+from iga_drake.demonstrations.demonstration import DemonstrationError, write_demonstrations
 from iga_drake.paths import diagrams_dir
+from iga_drake.policy.motion import Phase
 from iga_drake.station.scenario import LookAt, Scenario, load_scenario
-from iga_drake.systems.policy_sequence import Phase
 from iga_drake.tasks.episode import (
     EpisodeResult,
     _name_alignment,

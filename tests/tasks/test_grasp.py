@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from iga_drake.station.panda import gripper_cloud
-from iga_drake.station.scene import Scene
+from iga_drake.station.panda.model import gripper_cloud
+from iga_drake.station.simulated.scene import Scene
 from iga_drake.tasks.grasp import Grasp
 from iga_drake.tasks.task import ROBOT, TABLE, Snapshot
 

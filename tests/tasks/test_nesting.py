@@ -9,8 +9,8 @@ import trimesh
 from pydrake.math import RigidTransform
 from rest import Rest
 
-from iga_drake.shapes import bowl
-from iga_drake.station.panda import gripper_cloud
+from iga_drake.shapes.families import bowl
+from iga_drake.station.panda.model import gripper_cloud
 from iga_drake.tasks.nesting import nesting_height, release_height
 from iga_drake.tasks.stack import HELD, RELEASE_OPENING, TARGET, Stack, grip
 

@@ -8,8 +8,8 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from rest import Rest
 
-from iga_drake.shapes import bowl
-from iga_drake.station.scene import Scene
+from iga_drake.shapes.families import bowl
+from iga_drake.station.simulated.scene import Scene
 from iga_drake.tasks.nesting import nesting_height
 from iga_drake.tasks.stack import HELD, TARGET, Stack, grip
 from iga_drake.tasks.task import ROBOT, TABLE, Snapshot, read_snapshot, tilt

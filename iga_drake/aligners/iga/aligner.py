@@ -17,7 +17,8 @@ from torch import Tensor
 from iga_drake.aligners.iga.descriptor import DescriptorNet
 from iga_drake.aligners.iga.energy import PairEnergyNet, SearchConfig, minimise, pair_proposals
 from iga_drake.aligners.iga.voting import Match, VotingConfig, cast_votes, match_objects, modes
-from iga_drake.aligners.protocol import AlignerError, Alignment, PoseEstimate, check_cloud
+from iga_drake.aligners.protocol import AlignerError, PoseEstimate
+from iga_drake.demonstrations.alignment import Alignment, check_cloud
 from iga_drake.geometry.clouds import furthest_point_sampling
 from iga_drake.geometry.se3 import rigid
 from iga_drake.paths import models_dir

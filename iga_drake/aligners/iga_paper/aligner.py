@@ -12,7 +12,8 @@ from iga_drake.aligners.iga_paper.langevin import LangevinConfig
 from iga_drake.aligners.iga_paper.model import PaperModel, kind_of, load_model
 from iga_drake.aligners.iga_paper.nodes import Problem, problem
 from iga_drake.aligners.iga_paper.search import best, search_rotation, search_translation
-from iga_drake.aligners.protocol import AlignerError, Alignment, PoseEstimate, check_cloud
+from iga_drake.aligners.protocol import AlignerError, PoseEstimate
+from iga_drake.demonstrations.alignment import Alignment, check_cloud
 from iga_drake.geometry.se3 import geodesic_angle
 from iga_drake.paths import models_dir
 

@@ -11,7 +11,8 @@ from iga_drake.aligners.iga_paper.aligner import Asked, estimate, found_model
 from iga_drake.aligners.iga_paper.langevin import LangevinConfig, haar_rotations
 from iga_drake.aligners.iga_paper.model import PaperModel
 from iga_drake.aligners.iga_paper.search import correction_of, search_distance
-from iga_drake.aligners.protocol import Alignment, PoseEstimate
+from iga_drake.aligners.protocol import PoseEstimate
+from iga_drake.demonstrations.alignment import Alignment
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ bowl of a spoon (z out of the hollow).
 
 import numpy as np
 
-from iga_drake.shapes import bowl, pan, surfaces
+from iga_drake.shapes import surfaces
+from iga_drake.shapes.families import bowl, pan
 from iga_drake.shapes.families.attachments import in_plane, leaf, ring_handle, swept
 from iga_drake.shapes.families.turned import outline, solid, vessel
 from iga_drake.shapes.family import Draft, Family, Parameters

@@ -6,9 +6,9 @@ import pytest
 
 from iga_drake.aligners.icp import IcpAligner
 from iga_drake.aligners.iga.aligner import IgaAligner, IgaConfig
-from iga_drake.aligners.protocol import AlignerError, Alignment
 from iga_drake.dataset.alignment_error import pose_errors, random_pose
 from iga_drake.dataset.samples import make_sample
+from iga_drake.demonstrations.alignment import Alignment, CloudError
 from iga_drake.evaluation.alignment import evaluate_alignment
 
 
@@ -63,7 +63,7 @@ def test_repeated_points_add_nothing(ranking: str, distinct: int) -> None:
         assert np.isfinite(estimate.poses).all()
         shift, angle = pose_errors(estimate.poses[0], once.poses[0], thin)
         assert shift < 0.03 and angle < 0.5
-    with pytest.raises(AlignerError, match="48 points of which 12 are distinct"):
+    with pytest.raises(CloudError, match="48 points of which 12 are distinct"):
         few.align(context, np.tile(A[:12], (4, 1)), B)
 
 

@@ -6,8 +6,8 @@ import torch
 
 from iga_drake.aligners.iga.aligner import Explanation, IgaAligner
 from iga_drake.aligners.iga.voting import Votes, VotingConfig, modes
-from iga_drake.aligners.protocol import Alignment
 from iga_drake.dataset.samples import make_sample
+from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.geometry.se3 import random_rotations, rigid, so3_exp
 
 

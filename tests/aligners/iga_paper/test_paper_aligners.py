@@ -20,9 +20,10 @@ from iga_drake.aligners.iga_paper.variants import (
     DirRegConfig,
     descent,
 )
-from iga_drake.aligners.protocol import Aligner, AlignerError, Alignment
+from iga_drake.aligners.protocol import Aligner, AlignerError
 from iga_drake.aligners.registry import make_aligner
 from iga_drake.checkpoint import CheckpointError
+from iga_drake.demonstrations.alignment import Alignment
 
 QUICK = LangevinConfig(particles=6, steps=4)
 

@@ -27,7 +27,7 @@ def energies(net: GraphNetwork, demonstrations, test, R, t) -> torch.Tensor:
 def test_equal_to_pytorch_geometric(outputs: int) -> None:
     """The paper's sizes, single precision, values and gradients by poses."""
     pytest.importorskip("torch_geometric")
-    from iga_drake.evaluation.paper_reference import GraphReference
+    from iga_drake.studies.paper_reference import GraphReference
 
     torch.manual_seed(1)
     net = network(GraphConfig(), outputs=outputs)

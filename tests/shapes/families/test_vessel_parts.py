@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from family_properties import draws, stands_on_the_ground, winding_numbers
 
-from iga_drake.shapes import bowl, pan
-from iga_drake.shapes.families import FAMILIES
+from iga_drake.shapes.families import FAMILIES, bowl, pan
 from iga_drake.shapes.families.bottles import BOTTLES
 from iga_drake.shapes.families.tableware import BOWL, PAN, SPOON, TABLEWARE
 from iga_drake.shapes.families.vessels import VESSELS

@@ -1,0 +1,235 @@
+"""The simulation station: robot, table, objects and cameras behind the one port contract."""
+
+from typing import cast
+
+import numpy as np
+from pydrake.geometry import Box, Meshcat, SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant
+from pydrake.multibody.tree import RigidBody
+from pydrake.systems.framework import (
+    Diagram,
+    DiagramBuilder,
+    InputPort,
+    OutputPort,
+    PortDataType,
+)
+from pydrake.systems.primitives import MatrixGain
+from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
+
+from iga_drake.errors import IgaDrakeError
+from iga_drake.station.panda.command import PandaCommand
+from iga_drake.station.panda.model import PandaModel, Visuals, add_panda
+from iga_drake.station.scenario import Scenario, Table
+from iga_drake.station.simulated.cameras import add_camera, add_renderer
+from iga_drake.station.simulated.scene import Scene, SceneObject
+from iga_drake.systems.ports import HAND_OPENING_MAX, PANDA_JOINTS, Role, station_ports
+from iga_drake.systems.segmentation import Segmentation
+from iga_drake.viewing.meshcat import add_visualizers
+
+# Ports that no hardware has start with this: only experts, success predicates and tests use them.
+CHEAT = "cheat."
+
+
+class StationError(IgaDrakeError):
+    """A scene can't be built into a station, or a station breaks the port contract."""
+
+
+def build_simulation_station(
+    scenario: Scenario, scene: Scene, *, seed: int, meshcat: Meshcat | None = None
+) -> Diagram:
+    """Builds the diagram "station".
+
+    It exports `station_ports(scenario.camera_names)` and besides, under `cheat.`:
+    `cheat.body_poses` (list of X_WB by body index), `cheat.state` (plant state),
+    `cheat.contact_results` and `cheat.query_object`. Its default context is the scene: joint
+    angles, hand opening, object poses. Objects are free bodies, held by contact alone. The plant is
+    `station.GetSubsystemByName("plant")`; objects are its model instances by their names.
+
+    Args:
+      seed: >= 0; draws camera noise and calibration errors, with `scenario.seeds.cameras` added.
+      meshcat: where to show the scene; None shows nothing.
+
+    Raises:
+      StationError: the scene holds what can't be built; the message names the object.
+    """
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlant(config=scenario.plant, builder=builder)
+    plant.set_name("plant")
+    panda = add_panda(plant, controlled=True, visuals=cast(Visuals, scenario.panda.visuals))
+    _add_table(plant, scenario.table)
+    roles = {int(body): Role.ROBOT for body in plant.GetBodyIndices(panda.instance)}
+    for item in scene.objects:
+        body = _add_object(plant, item)
+        roles[int(body.index())] = _ROLES[item.role]
+    plant.Finalize()
+    _set_default_state(plant, panda, scene)
+
+    _add_robot_ports(builder, plant, panda, scenario)
+    add_renderer(scene_graph)
+    for index, (name, camera) in enumerate(scenario.cameras.items()):
+        ports = add_camera(
+            builder,
+            scene_graph,
+            name=name,
+            camera=camera,
+            seed=(seed + scenario.seeds.cameras, index),
+        )
+        size = {"width": camera.intrinsics.width, "height": camera.intrinsics.height}
+        segmentation = builder.AddNamedSystem(f"{name}.segmentation", Segmentation(roles, **size))
+        builder.Connect(ports["label_image"], segmentation.get_input_port())
+        ports["label_image"] = segmentation.get_output_port()
+        for port, output in ports.items():
+            builder.ExportOutput(output, f"{name}.{port}")
+    if meshcat is not None:
+        add_visualizers(
+            builder,
+            config=scenario.visualization,
+            plant=plant,
+            scene_graph=scene_graph,
+            meshcat=meshcat,
+        )
+    _add_cheat_ports(builder, plant, scene_graph)
+
+    station = builder.Build()
+    station.set_name("station")
+    check_port_contract(station, scenario.camera_names)
+    return station
+
+
+def check_port_contract(station: Diagram, cameras: tuple[str, ...]) -> None:
+    """Raises `StationError` unless `station` exports exactly the contract (`cheat.` ports aside).
+
+    Compares names, directions, the sizes of vectors and the kinds of abstract values.
+    """
+    found = {}
+    for i in range(station.num_input_ports()):
+        port = station.get_input_port(i)
+        found[port.get_name()] = ("input", _kind(port))
+    for i in range(station.num_output_ports()):
+        port = station.get_output_port(i)
+        if not port.get_name().startswith(CHEAT):
+            found[port.get_name()] = ("output", _kind(port))
+    wanted = {p.name: (p.direction, p.kind) for p in station_ports(cameras)}
+    problems = [f"'{n}' is missing" for n in wanted if n not in found]
+    problems += [f"'{n}' is not in the contract" for n in found if n not in wanted]
+    problems += [
+        f"'{n}' is {found[n]}, the contract says {wanted[n]}"
+        for n in wanted
+        if n in found and found[n] != wanted[n]
+    ]
+    if problems:
+        raise StationError(f"station '{station.get_name()}': " + "; ".join(problems))
+
+
+_KINDS = {
+    ImageRgba8U: "ImageRgba8U",
+    ImageDepth32F: "ImageDepth32F",
+    ImageLabel16I: "ImageLabel16I",
+    RigidTransform: "RigidTransform",
+}
+
+
+def _kind(port: InputPort | OutputPort) -> str:
+    """The contract's word for what a port carries."""
+    if port.get_data_type() == PortDataType.kVectorValued:
+        return f"vector({port.size()})"
+    value = type(port.Allocate().get_value())
+    return _KINDS.get(value, value.__name__)
+
+
+_ROLES = {"target": Role.TARGET, "grasped": Role.GRASPED, "other": Role.BACKGROUND}
+
+
+def _add_table(plant: MultibodyPlant, table: Table) -> None:
+    """Fixes the table to the world, its top at z = 0."""
+    body = plant.world_body()
+    X_WG = RigidTransform([*table.center, -table.size[2] / 2])
+    friction = CoulombFriction(table.friction, table.friction)
+    plant.RegisterCollisionGeometry(body, X_WG, Box(*table.size), "table", friction)
+    plant.RegisterVisualGeometry(
+        body, X_WG, Box(*table.size), "table", np.array([*table.color, 1.0])
+    )
+
+
+def _add_object(plant: MultibodyPlant, item: SceneObject) -> RigidBody:
+    """Parses one free body from its SDF text."""
+    if item.role not in _ROLES:
+        raise StationError(f"object '{item.name}': role '{item.role}', allowed: {[*_ROLES]}")
+    parser = Parser(plant)
+    parser.SetAutoRenaming(True)
+    try:
+        (instance,) = parser.AddModelsFromString(item.sdf, "sdf")
+        plant.RenameModelInstance(instance, item.name)
+        (body,) = plant.GetBodyIndices(instance)
+    except (RuntimeError, ValueError) as e:
+        raise StationError(
+            f"object '{item.name}': its SDF must hold one model with one link and its name must be "
+            f"free: {e}"
+        ) from e
+    return plant.get_body(body)
+
+
+def _set_default_state(plant: MultibodyPlant, panda: PandaModel, scene: Scene) -> None:
+    """Makes the plant's default context the scene's initial situation."""
+    q = np.asarray(scene.panda_position, dtype=float)
+    if q.shape != (PANDA_JOINTS,) or not np.isfinite(q).all():
+        raise StationError(f"scene.panda_position: expected 7 finite angles (rad), got {q}")
+    if not 0.0 <= scene.hand_opening <= HAND_OPENING_MAX:
+        raise StationError(
+            f"scene.hand_opening: {scene.hand_opening} m, allowed: 0..{HAND_OPENING_MAX} m"
+        )
+    for joint, angle in zip(panda.arm_joints, q, strict=True):
+        joint.set_default_positions([angle])
+    for joint in panda.finger_joints:
+        joint.set_default_positions([scene.hand_opening / 2])
+    for item in scene.objects:
+        instance = plant.GetModelInstanceByName(item.name)
+        (body,) = plant.GetBodyIndices(instance)
+        plant.SetDefaultFloatingBaseBodyPose(plant.get_body(body), item.X_WO)
+
+
+def _add_robot_ports(
+    builder: DiagramBuilder, plant: MultibodyPlant, panda: PandaModel, scenario: Scenario
+) -> None:
+    """Connects the arm's and the hand's commands and measurements."""
+    instance = panda.instance
+    command = builder.AddNamedSystem(
+        "panda.command", PandaCommand(time_step=scenario.plant.time_step)
+    )
+    builder.Connect(
+        command.GetOutputPort("desired_state"), plant.get_desired_state_input_port(instance)
+    )
+    for name in ("panda.position", "hand.opening"):
+        builder.ExportInput(command.GetInputPort(name), name)
+
+    # Where the joints stand in the robot's own state (q, v) and generalized force.
+    nq, nv = plant.num_positions(instance), plant.num_velocities(instance)
+    of_q = list(plant.GetPositionsFromArray(instance, np.arange(plant.num_positions())))
+    of_v = list(plant.GetVelocitiesFromArray(instance, np.arange(plant.num_velocities())))
+    arm_q = [of_q.index(joint.position_start()) for joint in panda.arm_joints]
+    arm_v = [of_v.index(joint.velocity_start()) for joint in panda.arm_joints]
+    opening = np.zeros((1, nq + nv))
+    opening[0, [of_q.index(joint.position_start()) for joint in panda.finger_joints]] = 1.0
+
+    state = plant.get_state_output_port(instance)
+    torque = plant.get_generalized_contact_forces_output_port(instance)
+    for name, matrix, source in (
+        ("panda.position_measured", np.eye(nq + nv)[arm_q], state),
+        ("panda.velocity_measured", np.eye(nq + nv)[[nq + v for v in arm_v]], state),
+        ("panda.torque_external", np.eye(nv)[arm_v], torque),
+        ("hand.opening_measured", opening, state),
+    ):
+        gain = builder.AddNamedSystem(name, MatrixGain(matrix))
+        builder.Connect(source, gain.get_input_port())
+        builder.ExportOutput(gain.get_output_port(), name)
+
+
+def _add_cheat_ports(
+    builder: DiagramBuilder, plant: MultibodyPlant, scene_graph: SceneGraph
+) -> None:
+    builder.ExportOutput(plant.get_body_poses_output_port(), f"{CHEAT}body_poses")
+    builder.ExportOutput(plant.get_state_output_port(), f"{CHEAT}state")
+    builder.ExportOutput(plant.get_contact_results_output_port(), f"{CHEAT}contact_results")
+    builder.ExportOutput(scene_graph.get_query_output_port(), f"{CHEAT}query_object")

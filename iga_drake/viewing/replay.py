@@ -1,0 +1,130 @@
+"""Pictures of an episode and of demonstrations, in Meshcat and as pages that need no server."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import Cylinder, Meshcat, MeshcatParams, Rgba
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.perception import BaseField, Fields, PointCloud
+
+from iga_drake.demonstrations.demonstration import DemonstrationSet
+
+TARGET_COLOR = Rgba(0.10, 0.45, 0.85, 1.0)
+GRASPED_COLOR = Rgba(0.95, 0.55, 0.10, 1.0)
+PREDICTED_COLOR = Rgba(0.15, 0.70, 0.30, 1.0)
+
+
+def quiet_meshcat() -> Meshcat:
+    """A Meshcat on this machine's own address alone."""
+    return Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+
+
+def show_cloud(
+    meshcat: Meshcat, path: str, points: np.ndarray, color: Rgba, size: float = 0.004
+) -> None:
+    """Shows `points` (P, 3) (m); an empty cloud removes what was shown there."""
+    meshcat.Delete(path)
+    if len(points) == 0:
+        return
+    cloud = PointCloud(new_size=len(points), fields=Fields(BaseField.kXYZs))
+    cloud.mutable_xyzs()[:] = np.asarray(points, dtype=np.float32).T
+    meshcat.SetObject(path, cloud, size, color)
+
+
+def show_triad(meshcat: Meshcat, path: str, X_WF: RigidTransform, length: float = 0.1) -> None:
+    """Shows a frame: x red, y green, z blue."""
+    about = {"x": RotationMatrix.MakeYRotation(np.pi / 2), "y": RotationMatrix.MakeXRotation(
+        -np.pi / 2), "z": RotationMatrix()}  # fmt: skip
+    for axis, (name, R) in enumerate(about.items()):
+        p = np.zeros(3)
+        p[axis] = length / 2
+        color = np.zeros(3)
+        color[axis] = 0.9
+        meshcat.SetObject(f"{path}/{name}", Cylinder(0.025 * length, length), Rgba(*color, 1.0))
+        meshcat.SetTransform(f"{path}/{name}", RigidTransform(R, p))
+    meshcat.SetTransform(path, X_WF)
+
+
+def show_prediction(
+    meshcat: Meshcat,
+    *,
+    target: np.ndarray,  # (Q, 3) in W
+    grasped_E: np.ndarray,  # (P, 3) in E
+    X_WE: RigidTransform | None = None,
+    path: str = "perception",
+) -> None:
+    """Shows the target cloud and, where a pose was predicted, the grasped cloud carried there."""
+    meshcat.SetCameraPose(np.array([1.5, -0.9, 0.8]), np.array([0.35, 0.0, 0.2]))
+    show_cloud(meshcat, f"{path}/target cloud", target, TARGET_COLOR)
+    if X_WE is not None:
+        show_triad(meshcat, f"{path}/predicted pose", X_WE)
+        if len(grasped_E):
+            show_cloud(
+                meshcat,
+                f"{path}/grasped cloud at the predicted pose",
+                (X_WE @ np.asarray(grasped_E).T).T,
+                PREDICTED_COLOR,
+            )
+
+
+def write_html(meshcat: Meshcat, path: Path | str) -> None:
+    """Writes all that Meshcat shows, recordings included, as one page; whole or not at all."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(meshcat.StaticHtml(), encoding="utf-8")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def show_demonstrations(
+    meshcat: Meshcat, demonstrations: DemonstrationSet, spacing: float = 0.6
+) -> None:
+    """Shows each demonstration beside the other, along y: both clouds and the waypoints' frames."""
+    meshcat.SetCameraPose(np.array([2.3, 0.0, 1.0]), np.array([0.5, 0.0, 0.0]))
+    for index, demonstration in enumerate(demonstrations.demonstrations):
+        root = f"demonstrations/{index}"
+        show_cloud(meshcat, f"{root}/target cloud", demonstration.target, TARGET_COLOR)
+        for name, X in zip(demonstration.names, demonstration.X_WE, strict=True):
+            X_WE = RigidTransform(X)
+            show_triad(meshcat, f"{root}/{name}/X_WE", X_WE, length=0.06)
+            show_cloud(
+                meshcat,
+                f"{root}/{name}/grasped cloud",
+                (X_WE @ demonstration.grasped.T).T,
+                GRASPED_COLOR,
+            )
+        middle = (len(demonstrations) - 1) / 2
+        meshcat.SetTransform(root, RigidTransform([0.0, spacing * (index - middle), 0.0]))
+
+
+def demonstrations_html(demonstrations: DemonstrationSet) -> str:
+    """A page with all demonstrations."""
+    meshcat = quiet_meshcat()
+    show_demonstrations(meshcat, demonstrations)
+    meshcat.Flush()
+    return meshcat.StaticHtml()
+
+
+def write_or_serve(meshcat: Meshcat, html: Path | None) -> None:
+    """Writes what is shown as a page, or prints its address and serves until Enter is pressed."""
+    if html is not None:
+        meshcat.Flush()
+        write_html(meshcat, html)
+        print(f"written: {html}")
+        return
+    print(f"open {meshcat.web_url()} in a browser; press Enter to end", flush=True)
+    try:
+        input()
+    except EOFError:
+        pass
+
+
+def serve_demonstrations(demonstrations: DemonstrationSet) -> None:
+    """Shows all demonstrations at an address that is printed, until Enter is pressed."""
+    meshcat = quiet_meshcat()
+    show_demonstrations(meshcat, demonstrations)
+    write_or_serve(meshcat, None)

@@ -1,0 +1,168 @@
+"""The diagnosis' measures against problems whose answer is known."""
+
+import argparse
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from iga_drake.aligners.iga.aligner import Explanation, IgaAligner
+from iga_drake.dataset.alignment_error import random_pose
+from iga_drake.dataset.samples import Sample
+from iga_drake.errors import IgaDrakeError
+from iga_drake.geometry.se3 import so3_exp, so3_log
+from iga_drake.studies.diagnosis import (
+    POSES,
+    Diagnosis,
+    Hypotheses,
+    ObjectMatches,
+    Problem,
+    add_evaluate_diagnosis,
+    deformation,
+    descend,
+    evaluate_diagnosis,
+    hypothesis_errors,
+    match_errors,
+    summarise,
+    true_logits,
+)
+
+SIGMA = 0.05
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return Problem.of("easy", 1)
+
+
+@pytest.fixture(scope="module")
+def informed(problem: Problem) -> Explanation:
+    return IgaAligner().explain(
+        *problem.query.clouds,
+        seed=1,
+        logits=lambda index: true_logits(problem.sample, index, SIGMA),
+    )
+
+
+def test_true_matches_are_the_nearest_nodes(problem: Problem, informed: Explanation) -> None:
+    for role in range(2):
+        errors = match_errors(problem.sample, informed, role, 0, 0.12)
+        assert errors["argmax"] == pytest.approx(errors["nearest"])
+        cm, share, _ = errors["soft"]
+        assert 0 < cm == pytest.approx(share * problem.sample.size[role, 0]) and share < 0.06
+
+
+def test_matches_that_know_nothing_are_off(problem: Problem, informed: Explanation) -> None:
+    blind = replace(informed, logits=torch.zeros_like(informed.logits))
+    errors = match_errors(problem.sample, blind, 1, 2, 0.12)
+    assert errors["argmax"][1] > 3 * errors["nearest"][1]
+    # The soft match of all nodes is their middle.
+    assert errors["soft"][1] > 3 * errors["nearest"][1]
+
+
+def test_true_matches_solve_an_easy_problem(problem: Problem, informed: Explanation) -> None:
+    translation, rotation = problem.error(informed.estimate.poses[0])
+    assert translation < 0.01 and np.degrees(rotation) < 6
+    off, modulo = hypothesis_errors(problem, informed, 0, 0)
+    assert np.degrees(off[0]) < 12 and all(m <= o for o, m in zip(off, modulo, strict=True))
+
+
+@pytest.mark.parametrize("role", [0, 1])
+def test_a_hypothesis_turned_by_an_angle_is_off_by_it(
+    problem: Problem, informed: Explanation, role: int
+) -> None:
+    off, _ = hypothesis_errors(problem, informed, role, 1)
+    turn = torch.from_numpy(Rotation.from_rotvec([0.0, 2.0, 0.0]).as_matrix())
+    matches = list(informed.matches)
+    matches[role] = [replace(m, R_DT=turn @ m.R_DT) for m in matches[role]]
+    turned, _ = hypothesis_errors(
+        problem, replace(informed, matches=(matches[0], matches[1])), role, 1
+    )
+    assert abs(turned[0] - 2.0) <= off[0] + 1e-6
+
+
+def _scaled(sample: Sample, factors: np.ndarray) -> Sample:
+    """Every instance a copy of the canonical one, scaled by factors (3,), moved anywhere."""
+    X = np.stack([random_pose(k) for k in range(sample.points[..., 0, 0].size)]).reshape(
+        *sample.points.shape[:2], 4, 4
+    )
+    points = sample.canonical * factors @ np.swapaxes(X[..., :3, :3], -1, -2)
+    points = points + X[..., None, :3, 3]
+    return replace(sample, points=points, size=np.ones_like(sample.size))
+
+
+def test_deformation_is_what_scale_and_motion_leave(problem: Problem) -> None:
+    assert deformation(_scaled(problem.sample, np.full(3, 0.4))) == pytest.approx(0, abs=1e-6)
+    mild, strong = (
+        deformation(_scaled(problem.sample, np.array([1.0, 1.0, f]))) for f in (1.1, 1.5)
+    )
+    assert 0.001 < mild < strong / 3
+
+
+def test_descent_ends_at_the_minimum() -> None:
+    goal = torch.from_numpy(random_pose(0))
+
+    def energy(X: torch.Tensor) -> torch.Tensor:
+        off = so3_log(X[:3, :3] @ goal[:3, :3].T)
+        return 3 * off.square().sum() + 400 * (X[:3, 3] - goal[:3, 3]).square().sum() - 2
+
+    start = goal.clone()
+    start[:3, :3] = so3_exp(torch.tensor([0.4, -0.3, 0.2]).double()) @ goal[:3, :3]
+    start[:3, 3] += 0.05
+    end = descend(energy, start.numpy(), np.array([0.02, 0.0, 0.03]))
+    np.testing.assert_allclose(end, goal.numpy(), atol=1e-4)
+
+
+def _matches(category: str, *degrees: float) -> ObjectMatches:
+    off = tuple(np.radians(degrees))
+    return ObjectMatches(category, off, tuple(0 * a for a in off), {})
+
+
+def _row(index: int, error: float, energies: tuple[float, ...], deformed: float) -> Diagnosis:
+    errors = dict.fromkeys(POSES, (error / 100, np.radians(error)))
+    return Diagnosis("easy", index, errors, *energies, deformed, (_matches("mug", 10, 90),))
+
+
+def test_shares_of_wrong_hypotheses() -> None:
+    some = Hypotheses.of([_matches("mug", 10, 90), _matches("pan", 60), _matches("pan", 50, 20)])
+    assert some.first == pytest.approx((2 / 3, 0)) and some.kept == pytest.approx((3 / 5, 0))
+    assert some.none == pytest.approx((1 / 3, 0)) and some.count == 3
+
+
+def test_the_summary_counts_energies_and_sorts_by_deformation() -> None:
+    below, missed = (-2.0, -1.0, -2.1, -2.1), (-1.0, -2.0, -1.0, -2.5)
+    summary = summarise(
+        [_row(0, 9.0, missed, 0.3), _row(1, 1.0, below, 0.1), _row(2, 5.0, below, 0.2)]
+    )
+    assert summary.below_truth == pytest.approx(2 / 3)
+    assert summary.missed == pytest.approx(1 / 3) and summary.gap_median == pytest.approx(1)
+    assert [e.translation_mean for _, _, e in summary.deformation] == pytest.approx([1, 5, 9])
+    table = summary.table(categories=True)
+    assert "67 % of the samples" in table and "mug" in table
+
+
+def _arguments(*options: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    add_evaluate_diagnosis(parser)
+    return parser.parse_args(options)
+
+
+def test_the_command_prints_json(capsys: pytest.CaptureFixture) -> None:
+    assert evaluate_diagnosis(_arguments("--sets", "easy", "--count", "1", "--json")) == 0
+    (entry,) = json.loads(capsys.readouterr().out)
+    (sample,) = entry["samples"]
+    assert set(sample["errors"]) <= set(POSES) and len(sample["objects"]) == 8
+    assert sample["energy_from_found"] <= sample["energy_found"] + 1e-5
+    count, errors = entry["errors"]["found"]
+    assert count == 1
+    assert errors["translation_mean"] == pytest.approx(100 * sample["errors"]["found"][0])
+
+
+def test_unknown_sets_and_no_samples_are_refused() -> None:
+    with pytest.raises(IgaDrakeError, match="nowhere"):
+        evaluate_diagnosis(_arguments("--sets", "easy,nowhere"))
+    with pytest.raises(IgaDrakeError, match="--count 0"):
+        evaluate_diagnosis(_arguments("--count", "0"))
