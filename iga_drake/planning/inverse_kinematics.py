@@ -7,7 +7,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.solvers import SnoptSolver, SolverOptions
 
 from iga_drake.errors import IgaDrakeError
-from iga_drake.planning.planning_robot import PlanningRobot
+from iga_drake.planning.planning_robot import PlanningConfig, PlanningRobot
 
 _POSITION_TOLERANCE = 1e-5  # m
 _ROTATION_TOLERANCE = 1e-4  # rad
@@ -25,12 +25,11 @@ class PoseSolver:
     def __init__(
         self,
         robot: PlanningRobot,
-        *,
-        starts: int = 20,
-        position_margin: float = 0.05,
+        config: PlanningConfig | None = None,
     ) -> None:
-        """`starts`: number of starting postures. `position_margin`: distance (rad) that the angles
-        keep from the joints' limits; at least that of the controller that follows."""
+        config = config or PlanningConfig()
+        config.check("PlanningConfig")
+        starts, position_margin = config.starts, config.position_margin
         self.robot = robot
         self._plant = robot.checker.plant()
         limits = robot.limits

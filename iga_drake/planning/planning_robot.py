@@ -8,6 +8,28 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import Frame
 from pydrake.planning import DofMask, JointLimits, SceneGraphCollisionChecker
 
+from iga_drake.errors import check_range
+
+
+@dataclass
+class PlanningConfig:
+    """Distances that planned and commanded motions keep."""
+
+    # Distance (m) that links keep from each other.
+    safety_distance: float = 0.01
+    # Distance (m) that links keep from the table's top.
+    table_distance: float = 0.002
+    # Distance (rad) that planned postures keep from the joints' limits; at least that of the
+    # controller that follows.
+    position_margin: float = 0.05
+    # Number of starting postures of inverse kinematics.
+    starts: int = 20
+
+    def check(self, where: str = "planning") -> None:
+        """Raises `ConfigError` for a value out of range."""
+        for name, value in vars(self).items():
+            check_range(value >= 0, f"{where}.{name}", value, ">= 0")
+
 
 @dataclass(frozen=True)
 class PlanningRobot:

@@ -1,5 +1,6 @@
 """The policy as a system: from clouds and demonstrations to end-effector targets."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -8,20 +9,14 @@ from pydrake.math import RigidTransform
 from pydrake.perception import PointCloud
 from pydrake.systems.framework import Context, InputPort, LeafSystem, State
 
+from iga_drake.demonstrations.demonstration import ObservedRole
 from iga_drake.policy.machine import PolicyMachine, PolicyMemory
 from iga_drake.systems.messages import FollowerStatus, SupervisorStatus
 from iga_drake.systems.ports import PANDA_JOINTS
 
 
-def to_point_cloud(points: np.ndarray) -> PointCloud:
-    """A Drake cloud of `points` (P, 3) (m)."""
-    cloud = PointCloud(new_size=len(points))
-    cloud.mutable_xyzs()[:] = np.asarray(points, dtype=np.float32).T
-    return cloud
-
-
 class IgaPolicy(LeafSystem):
-    """Observes, infers where the grasped object has to go, and moves it there.
+    """Observes, infers where the grasped objects have to go, and moves them there.
 
     All work is done in a periodic unrestricted update that writes one abstract state; every output
     only reads that state. Cloud inputs are pulled in the observing phases alone.
@@ -40,25 +35,29 @@ class IgaPolicy(LeafSystem):
         output_ports:
         - target
         - status
-        - estimate
-        - energy
-        - target_observed
-        - grasped_observed
+        - observations
+        - estimates
+        - energies
 
-    `camera_counts` is a dict of camera name -> value with `valid`, the pixels with a depth.
-    `target` is an `EndEffectorTarget`, of sequence 0 while the arm has not been asked to move;
-    `status` a `PolicyStatus` (phase, timeline, reason); `estimate` a tuple of the `PoseEstimate`,
-    empty before there is one; `energy` the energy of the chosen pose (NaN before there is one);
-    `target_observed` the observed target cloud in W; `grasped_observed` the grasped cloud in E that
-    the aligner was given.
+    - `target_cloud`, `grasped_cloud` (PointCloud, m in W): what the cameras see of each role.
+    - `camera_counts` (dict of camera name -> `CameraCounts`): a camera without valid pixels is
+      waited for.
+    - `pose_measured` (RigidTransform): X_WE. `panda.position_measured` (7, rad).
+    - `target` (EndEffectorTarget): of sequence 0 while the arm has not been asked to move.
+    - `status` (PolicyStatus): phase, timeline, reason.
+    - `observations` (dict of name -> `Observation`): the clouds observed so far.
+    - `estimates` (tuple of `PoseEstimate`): of each waypoint inferred so far.
+    - `energies` (T): energy of the pose chosen for each waypoint; NaN before there is one.
     """
 
     def __init__(self, machine: PolicyMachine) -> None:
         super().__init__()
         self._machine = machine
         cloud = Value[PointCloud]()
-        self._target_cloud_input = self.DeclareAbstractInputPort("target_cloud", cloud)
-        self._grasped_cloud_input = self.DeclareAbstractInputPort("grasped_cloud", cloud)
+        self._cloud_inputs: dict[ObservedRole, InputPort] = {
+            "target": self.DeclareAbstractInputPort("target_cloud", cloud),
+            "grasped": self.DeclareAbstractInputPort("grasped_cloud", cloud),
+        }
         self._counts_input = self.DeclareAbstractInputPort("camera_counts", AbstractValue.Make({}))
         self._pose_input = self.DeclareAbstractInputPort("pose_measured", Value[RigidTransform]())
         self._position_input = self.DeclareVectorInputPort("panda.position_measured", PANDA_JOINTS)
@@ -72,8 +71,8 @@ class IgaPolicy(LeafSystem):
         self._memory_index = self.DeclareAbstractState(AbstractValue.Make(start))
         state = {self.abstract_state_ticket(self._memory_index)}
 
-        def declare(name: str, example, read) -> None:
-            def calc(context: Any, output: Any) -> None:
+        def declare(name: str, example: Any, read: Any) -> None:
+            def calc(context: Context, output: AbstractValue) -> None:
                 output.set_value(read(self.memory(context)))
 
             self.DeclareAbstractOutputPort(
@@ -82,10 +81,14 @@ class IgaPolicy(LeafSystem):
 
         declare("target", start.target, lambda memory: memory.target)
         declare("status", start.status, lambda memory: memory.status)
-        declare("estimate", (), lambda m: () if m.estimate is None else (m.estimate,))
-        declare("target_observed", PointCloud(), lambda m: to_point_cloud(m.target_points))
-        declare("grasped_observed", PointCloud(), lambda m: to_point_cloud(m.grasped_points_E))
-        self.DeclareVectorOutputPort("energy", 1, self._calc_energy, prerequisites_of_calc=state)
+        declare("observations", {}, lambda memory: dict(memory.observations))
+        declare("estimates", (), lambda memory: memory.estimates)
+        self.DeclareVectorOutputPort(
+            "energies",
+            len(machine.motion.waypoints),
+            self._calc_energies,
+            prerequisites_of_calc=state,
+        )
         self.DeclarePeriodicUnrestrictedUpdateEvent(machine.config.period, 0.0, self._update)
 
     def memory(self, context: Context) -> PolicyMemory:
@@ -93,9 +96,11 @@ class IgaPolicy(LeafSystem):
         abstract: Any = context.get_abstract_state(int(self._memory_index))
         return abstract.get_value()
 
-    def _calc_energy(self, context: Context, output) -> None:
-        chosen = self.memory(context).chosen
-        output.SetAtIndex(0, np.nan if chosen is None else chosen.energy)
+    def _calc_energies(self, context: Context, output: Any) -> None:
+        energies = np.full(len(self._machine.motion.waypoints), np.nan)
+        for index, chosen in enumerate(self.memory(context).chosen):
+            energies[index] = chosen.energy
+        output.SetFromVector(energies)
 
     def _update(self, context: Context, state: State) -> None:
         memory = self._machine.advance(
@@ -114,17 +119,18 @@ class _Pull:
     def _read(self, port: InputPort) -> Any:
         return port.Eval(self._context)
 
-    def target_cloud(self) -> np.ndarray:
-        return self._read(self._policy._target_cloud_input).xyzs().T.copy()
+    def cloud(self, role: ObservedRole) -> np.ndarray:
+        return self._read(self._policy._cloud_inputs[role]).xyzs().T.copy()
 
-    def grasped_cloud(self) -> np.ndarray:
-        return self._read(self._policy._grasped_cloud_input).xyzs().T.copy()
-
-    def silent_cameras(self) -> tuple[str, ...]:
+    def silent_cameras(self) -> Mapping[str, str]:
         port = self._policy._counts_input
         if not port.HasValue(self._context):
-            return ()
-        return tuple(name for name, counts in self._read(port).items() if counts.valid == 0)
+            return {}
+        return {
+            name: counts.problem or "delivered no depth: check the camera and its connection"
+            for name, counts in self._read(port).items()
+            if counts.valid == 0
+        }
 
     def pose(self) -> RigidTransform:
         return RigidTransform(self._read(self._policy._pose_input))

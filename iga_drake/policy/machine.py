@@ -2,22 +2,30 @@
 
 `PolicyMachine.advance` is a function of the memory, the time and the inputs. Inputs are asked for
 only where a phase needs them, so cameras render in the observing phases and at no other time.
+
+The order of things: every cloud that can be observed now is observed, the waypoints whose clouds
+are all known are inferred, each on its own, and followed one after the other. Where a later
+waypoint needs a cloud that can only be seen after an earlier one was followed, the policy goes back
+from moving to observing.
 """
 
+import math
 import time as wall
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
 from pydrake.math import RigidTransform
 
-from iga_drake.aligners.protocol import Aligner, PoseEstimate
-from iga_drake.demonstrations.demonstration import DemonstrationSet
-from iga_drake.errors import IgaDrakeError
+from iga_drake.aligners.protocol import PoseEstimate
+from iga_drake.demonstrations.demonstration import DemonstrationSet, Observation, ObservedRole
+from iga_drake.errors import check_range
+from iga_drake.policy.inference import Inference, InferenceFailure
 from iga_drake.policy.motion import (
-    Cause,
     MotionStep,
+    ObservationPlan,
     Phase,
     PhaseEntry,
     PolicyError,
@@ -30,14 +38,13 @@ from iga_drake.policy.motion import (
     motion_steps,
     moved_steps,
 )
-from iga_drake.systems.messages import EndEffectorTarget, FollowerStatus, SupervisorStatus
+from iga_drake.systems.messages import Cause, EndEffectorTarget, FollowerStatus, SupervisorStatus
+
+INFERENCE_WAYS = ("lockstep", "delay", "concurrent")
+DOWN_W = np.array([0.0, 0.0, -1.0])
 
 
-def _no_points() -> np.ndarray:
-    return np.zeros((0, 3))
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class PolicyConfig:
     """Rates and limits of the policy."""
 
@@ -47,38 +54,58 @@ class PolicyConfig:
     observe_settle: float = 0.5
     # Time (s) between attempts to observe.
     observe_retry: float = 2.0
-    # Limits (s) of the observing phases.
-    observe_target_limit: float = 10.0
-    observe_grasped_limit: float = 10.0
+    # Limit (s) of each observing phase.
+    observe_limit: float = 20.0
     # Fewest usable points of an observed cloud.
     minimum_points: int = 64
-    # Limits (s) of the moving phases.
-    present_limit: float = 30.0
-    execute_limit: float = 60.0
-    # Limit (s) of one inference, wall-clock time.
+    # Limit (s) of each way to where the hand shows its object to the cameras.
+    present_limit: float = 20.0
+    # Limit (s) of the motion around each waypoint.
+    move_limit: float = 60.0
+    # What happens while the aligner works. "lockstep": simulated time waits, so that runs can be
+    # repeated exactly. "delay": the answer arrives `infer_delay` after the question, in simulated
+    # time. "concurrent": the loop runs on and the arm holds until the answer is there.
+    inference: str = "lockstep"
+    # Time (s) between question and answer, for "delay".
+    infer_delay: float = 1.0
+    # Limit (s) of each inference, wall-clock time.
     infer_limit: float = 60.0
     # Least `PoseEstimate.familiarity`, in [0, 1]: below it the policy refuses. 0 refuses nothing.
     minimum_familiarity: float = 0.0
-    # Seed given to the aligner.
-    seed: int = 0
+
+    def check(self, where: str = "policy") -> None:
+        """Raises `ConfigError` for a value out of range."""
+        for name in (
+            "period", "observe_retry", "observe_limit", "present_limit", "move_limit", "infer_limit"
+        ):  # fmt: skip
+            value = getattr(self, name)
+            check_range(value > 0, f"{where}.{name}", value, "> 0")
+        for name in ("observe_settle", "infer_delay", "minimum_points"):
+            value = getattr(self, name)
+            check_range(value >= 0, f"{where}.{name}", value, ">= 0")
+        least = self.minimum_familiarity
+        check_range(0 <= least <= 1, f"{where}.minimum_familiarity", least, "0..1")
+        ways = ", ".join(INFERENCE_WAYS)
+        check_range(self.inference in INFERENCE_WAYS, f"{where}.inference", self.inference, ways)
 
 
 class PolicyInputs(Protocol):
     """What the machine may ask for in one tick; each call pulls one input port."""
 
-    def target_cloud(self) -> np.ndarray:  # (P, 3) in W
+    def cloud(self, role: ObservedRole) -> np.ndarray:
+        """(P, 3) m in W, what the cameras see of the objects with this role."""
         ...
 
-    def grasped_cloud(self) -> np.ndarray:  # (P, 3) in W
+    def silent_cameras(self) -> Mapping[str, str]:
+        """Name of each camera that delivered nothing usable -> why, in words."""
         ...
 
-    def silent_cameras(self) -> tuple[str, ...]:  # names of cameras without any depth
+    def pose(self) -> RigidTransform:
+        """Measured X_WE."""
         ...
 
-    def pose(self) -> RigidTransform:  # measured X_WE
-        ...
-
-    def position(self) -> np.ndarray:  # (7,) rad
+    def position(self) -> np.ndarray:
+        """(7,) rad, measured."""
         ...
 
     def follower(self) -> FollowerStatus: ...
@@ -94,13 +121,18 @@ class PolicyMemory:
     phase_started: float
     target: EndEffectorTarget
     observe_next: float = 0.0
-    target_points: np.ndarray = field(default_factory=_no_points)  # (Q, 3) in W
-    grasped_points_W: np.ndarray = field(default_factory=_no_points)  # (P, 3) in W, when observed
-    grasped_points_E: np.ndarray = field(default_factory=_no_points)  # (P, 3) in E
-    estimate: PoseEstimate | None = None
-    chosen: ReachablePose | None = None
+    # Name of the plan -> what was observed.
+    observations: Mapping[str, Observation] = field(default_factory=lambda: MappingProxyType({}))
+    # Of each waypoint, as far as it was inferred.
+    estimates: tuple[PoseEstimate, ...] = ()
+    chosen: tuple[ReachablePose, ...] = ()
+    # The inference under way, and the wall-clock time at which it began (s).
+    question: int | None = None
+    asked: float = 0.0
     steps: tuple[MotionStep, ...] = ()
     step: int = 0
+    # Number of waypoints that are behind.
+    followed: int = 0
 
     def __deepcopy__(self, memo: dict) -> "PolicyMemory":
         """Itself: it is replaced, never changed, and Drake copies it at every update."""
@@ -108,50 +140,62 @@ class PolicyMemory:
 
 
 class PolicyMachine:
-    """Observe, infer, execute.
+    """Observe, infer, move, over any number of waypoints.
 
     Args:
-        motion: how the task moves around its waypoint.
-        aligner: finds the waypoint's `X_WE`.
-        demonstrations: of one waypoint; None gives the aligner an empty context.
-        gripper_points: (P, 3) cloud of the gripper in E: the grasped object where none is held.
+        motion: what the task observes and how it moves around its waypoints.
+        inference: finds the waypoints' `X_WE`.
+        demonstrations: of the same waypoints; None takes the hand's openings from `motion`.
+        gripper: opening (m) of the hand -> (P, 3) cloud of the gripper in E.
         solve: inverse kinematics, `solve(X_WE, q_near) -> (7,) rad or None`.
+        seed: given to the aligner.
     """
 
     def __init__(
         self,
         *,
         motion: TaskMotion,
-        aligner: Aligner,
+        inference: Inference,
         demonstrations: DemonstrationSet | None,
-        gripper_points: np.ndarray,
+        gripper: Callable[[float], np.ndarray],
         solve: Callable[[RigidTransform, np.ndarray], np.ndarray | None],
         config: PolicyConfig | None = None,
+        seed: int = 0,
     ) -> None:
-        if demonstrations is not None and len(demonstrations.waypoints) != 1:
-            raise PolicyError(
-                f"demonstrations of task '{demonstrations.task}': "
-                f"{len(demonstrations.waypoints)} waypoints found, 1 expected"
-            )
+        if demonstrations is not None:
+            found = demonstrations.demonstrations[0].relations
+            if found != motion.relations:
+                raise PolicyError(
+                    f"demonstrations of task '{demonstrations.task}': waypoints {list(found)} "
+                    f"(name, grasped, target) found, {list(motion.relations)} expected"
+                )
         self.config = config or PolicyConfig()
-        self._motion = motion
-        self._aligner = aligner
+        self.config.check("PolicyConfig")
+        self.motion = motion
+        self.inference = inference
         self._demonstrations = demonstrations
-        self._gripper_points = np.asarray(gripper_points, dtype=np.float64)
+        self._gripper = gripper
         self._solve = solve
+        self._seed = seed
+        self._plans = {plan.name: plan for plan in motion.observations}
 
     def start(self) -> PolicyMemory:
         """The memory before the first tick: the arm stays, the hand keeps its approach opening."""
-        phase = Phase.OBSERVE_TARGET
+        first = self._unseen({}, 0)
+        subject = "" if first is None else first.name
+        phase = Phase.OBSERVE
+        opening = self.motion.waypoints[0].opening_approach
         return PolicyMemory(
-            status=PolicyStatus(phase=phase, timeline=(PhaseEntry(time=0.0, phase=phase),)),
+            status=PolicyStatus(
+                phase=phase, timeline=(PhaseEntry(time=0.0, phase=phase, subject=subject),)
+            ),
             phase_started=0.0,
             observe_next=self.config.observe_settle,
             target=EndEffectorTarget(
                 sequence=0,
                 X_WE=RigidTransform(),
-                opening_moving=self._motion.opening_approach,
-                opening_reached=self._motion.opening_approach,
+                opening_moving=opening,
+                opening_reached=opening,
             ),
         )
 
@@ -162,156 +206,219 @@ class PolicyMachine:
             return memory
         supervisor = inputs.supervisor()
         if supervisor.holding:
-            return self._fail(
-                memory, inputs, now, f"supervisor: {supervisor.reason}", _cause(supervisor.reason)
-            )
+            self.inference.cancel()
+            cause = supervisor.cause or Cause.IK
+            return self._fail(memory, inputs, now, f"supervisor: {supervisor.reason}", cause)
         match phase:
-            case Phase.OBSERVE_TARGET:
+            case Phase.OBSERVE:
                 return self._observe(memory, inputs, now)
-            case Phase.PRESENT_GRASPED:
+            case Phase.PRESENT:
                 return self._present(memory, inputs, now)
-            case Phase.OBSERVE_GRASPED:
-                return self._observe(memory, inputs, now)
             case Phase.INFER:
                 return self._infer(memory, inputs, now)
             case _:
-                return self._execute(memory, inputs, now)
+                return self._move(memory, inputs, now)
+
+    # What comes next
+
+    def _unseen(self, seen: Mapping[str, Observation], followed: int) -> ObservationPlan | None:
+        """The first cloud that the cameras have to see now."""
+        for plan in self.motion.observations:
+            if plan.role != "gripper" and plan.name not in seen and plan.after <= followed:
+                return plan
+        return None
+
+    def _continue(
+        self, memory: PolicyMemory, inputs: PolicyInputs, now: float, detail: str = ""
+    ) -> PolicyMemory:
+        """Enters the phase that follows when one is over."""
+        if memory.followed == len(self.motion.waypoints):
+            return self._enter(memory, Phase.DONE, now, detail=detail)
+        plan = self._unseen(memory.observations, memory.followed)
+        if plan is not None and plan.present is None:
+            memory = replace(memory, observe_next=max(now, self.config.observe_settle))
+            return self._enter(memory, Phase.OBSERVE, now, plan.name, detail)
+        if plan is not None:
+            return self._start_present(memory, plan, now, detail)
+        memory = self._see_gripper(memory, inputs, now)
+        nearest = len(memory.estimates)
+        if nearest < len(self.motion.waypoints):
+            waypoint = self.motion.waypoints[nearest]
+            if {waypoint.grasped, waypoint.target} <= set(memory.observations):
+                return self._enter(memory, Phase.INFER, now, waypoint.name, detail)
+        return self._start_move(memory, now, detail)
+
+    def _see_gripper(
+        self, memory: PolicyMemory, inputs: PolicyInputs, now: float
+    ) -> PolicyMemory:
+        """Adds the hand's own points to what was observed, where a waypoint relates them."""
+        for plan in self.motion.observations:
+            if plan.role != "gripper" or plan.name in memory.observations:
+                continue
+            if plan.after <= memory.followed:
+                first = next(w for w in self.motion.waypoints if w.grasped == plan.name)
+                points = self._gripper(first.opening_approach)
+                memory = self._note(memory, inputs, now, plan, points)
+        return memory
+
+    def _note(
+        self,
+        memory: PolicyMemory,
+        inputs: PolicyInputs,
+        now: float,
+        plan: ObservationPlan,
+        points: np.ndarray,
+    ) -> PolicyMemory:
+        """Adds a cloud, `points` (P, 3) in the plan's frame, to what was observed."""
+        gravity = DOWN_W if plan.frame == "W" else inputs.pose().rotation().matrix().T @ DOWN_W
+        seen = Observation(
+            points=points, role=plan.role, frame=plan.frame, time=now, gravity=gravity
+        )
+        return replace(
+            memory, observations=MappingProxyType({**memory.observations, plan.name: seen})
+        )
 
     # Phases
 
     def _observe(self, memory: PolicyMemory, inputs: PolicyInputs, now: float) -> PolicyMemory:
+        plan = self._unseen(memory.observations, memory.followed)
+        if plan is None:  # all that is needed is the gripper
+            return self._continue(memory, inputs, now)
         if now < memory.observe_next:
             return memory
-        of_target = memory.status.phase is Phase.OBSERVE_TARGET
-        role = "target" if of_target else "grasped"
         try:
             silent = inputs.silent_cameras()
             if silent:
-                raise Refusal(
-                    f"{', '.join(silent)} delivered no depth: check the camera and its connection"
-                )
+                raise Refusal("; ".join(f"{name} {why}" for name, why in silent.items()))
             points = check_observation(
-                inputs.target_cloud() if of_target else inputs.grasped_cloud(),
-                role,
-                minimum=self.config.minimum_points,
+                inputs.cloud(plan.role), plan.name, minimum=self.config.minimum_points
             )
         except Refusal as refusal:
             again = now + self.config.observe_retry
-            limit = (
-                self.config.observe_target_limit if of_target else self.config.observe_grasped_limit
-            )
-            if again - memory.phase_started > limit:
-                return self._refuse(memory, now, str(refusal), "perception")
+            if again - memory.phase_started > self.config.observe_limit:
+                return self._refuse(memory, now, str(refusal), Cause.PERCEPTION)
             return replace(memory, observe_next=again)
-        if of_target:
-            memory = replace(memory, target_points=points)
-            if self._motion.observes_grasped:
-                return self._start_present(memory, inputs, now)
-            return self._enter(
-                replace(memory, grasped_points_E=self._gripper_points),
-                Phase.INFER,
-                now,
-                f"target {len(points)} points",
-            )
-        # The arm is at rest: the measured pose belongs to this very image.
-        X_EW = inputs.pose().inverse()
-        memory = replace(
-            memory, grasped_points_W=points, grasped_points_E=(X_EW @ points.T).T.copy()
-        )
-        return self._enter(memory, Phase.INFER, now, f"grasped {len(points)} points")
+        if plan.frame == "E":
+            # The arm is at rest: the measured pose belongs to this very image.
+            points = (inputs.pose().inverse() @ points.T).T
+        memory = self._note(memory, inputs, now, plan, points)
+        return self._continue(memory, inputs, now, f"{plan.name} {len(points)} points")
 
     def _start_present(
-        self, memory: PolicyMemory, inputs: PolicyInputs, now: float
+        self, memory: PolicyMemory, plan: ObservationPlan, now: float, detail: str
     ) -> PolicyMemory:
-        assert self._motion.present is not None
+        assert plan.present is not None
+        opening = memory.target.opening_reached
         step = MotionStep(
-            name="present",
+            name=f"present {plan.name}",
             target=EndEffectorTarget(
                 sequence=memory.target.sequence + 1,
-                X_WE=self._motion.present,
-                opening_moving=self._motion.opening_approach,
-                opening_reached=self._motion.opening_approach,
+                X_WE=plan.present,
+                opening_moving=opening,
+                opening_reached=opening,
                 settle=self.config.observe_settle,
-                nominal_posture=self._motion.present_posture,
+                nominal_posture=plan.present_posture,
             ),
         )
         memory = replace(memory, steps=(step,), step=0, target=step.target)
-        detail = f"target {len(memory.target_points)} points"
-        return self._enter(memory, Phase.PRESENT_GRASPED, now, detail)
+        return self._enter(memory, Phase.PRESENT, now, plan.name, detail)
 
     def _present(self, memory: PolicyMemory, inputs: PolicyInputs, now: float) -> PolicyMemory:
         if inputs.follower().sequence_reached >= memory.target.sequence:
-            return self._enter(replace(memory, observe_next=now), Phase.OBSERVE_GRASPED, now)
+            memory = replace(memory, observe_next=now)
+            return self._enter(memory, Phase.OBSERVE, now, memory.status.subject)
         return self._check_time(memory, inputs, now, self.config.present_limit)
 
     def _infer(self, memory: PolicyMemory, inputs: PolicyInputs, now: float) -> PolicyMemory:
-        context = () if self._demonstrations is None else self._demonstrations.context(0)
-        began = wall.perf_counter()
-        try:
-            estimate = self._aligner.align(
-                context, memory.grasped_points_E, memory.target_points, seed=self.config.seed
+        index, config = len(memory.estimates), self.config
+        waypoint = self.motion.waypoints[index]
+        if memory.question is None:
+            grasped, target = (
+                memory.observations[name].points for name in (waypoint.grasped, waypoint.target)
             )
-        except (IgaDrakeError, RuntimeError, np.linalg.LinAlgError) as error:
-            # Refused input, or numerics that gave up (PyTorch, Open3D, NumPy): the arm holds.
-            return self._refuse(memory, now, f"aligner {self._aligner.name}: {error}", "alignment")
-        seconds = wall.perf_counter() - began
+            question = self.inference.start(index, grasped, target, self._seed)
+            memory = replace(memory, question=question, asked=wall.perf_counter())
+        assert memory.question is not None
+        left = config.infer_limit - (wall.perf_counter() - memory.asked)
+        waits = config.inference == "lockstep" or (
+            config.inference == "delay"
+            and now - memory.phase_started >= config.infer_delay - config.period / 2
+        )
+        if config.inference == "delay" and not waits:
+            return memory
+        try:
+            answer = self.inference.poll(memory.question, left if waits else 0.0)
+        except InferenceFailure as failure:
+            return self._refuse(memory, now, str(failure), failure.cause)
+        seconds = wall.perf_counter() - memory.asked if answer is None else answer.seconds
+        if seconds >= config.infer_limit or (answer is None and waits):
+            self.inference.cancel()
+            reason = (
+                f"aligner {self.inference.name}: no answer after {seconds:.1f} s, the limit is "
+                f"{config.infer_limit:g} s"
+            )
+            return self._refuse(memory, now, reason, Cause.TIME)
+        if answer is None:
+            return memory
+        estimate = answer.estimate
         status = replace(
             memory.status, inference_seconds=(*memory.status.inference_seconds, seconds)
         )
-        memory = replace(memory, estimate=estimate, status=status)
-        if seconds > self.config.infer_limit:
-            reason = f"inference took {seconds:.1f} s, the limit is {self.config.infer_limit:g} s"
-            return self._refuse(memory, now, reason, "time")
-        if not (np.isfinite(estimate.poses).all() and np.isfinite(estimate.energies).all()):
-            reason = f"aligner {self._aligner.name}: poses or energies are not finite"
-            return self._refuse(memory, now, reason, "alignment")
-        familiarity, least = estimate.familiarity, self.config.minimum_familiarity
-        if familiarity is not None and familiarity < least:
+        memory = replace(
+            memory, estimates=(*memory.estimates, estimate), status=status, question=None
+        )
+        familiarity, least = estimate.familiarity, config.minimum_familiarity
+        if familiarity is not None and not familiarity >= least:
             reason = (
-                f"aligner {self._aligner.name}: these objects look like none of the demonstrations "
-                f"(familiarity {familiarity:.2f}, {least:g} is asked for): demonstrate the task "
-                "with such objects, or ask for less"
+                f"aligner {self.inference.name}: these objects look like none of the "
+                f"demonstrations (familiarity {familiarity:.2f}, {least:g} is asked for): "
+                "demonstrate the task with such objects, or ask for less"
             )
-            return self._refuse(memory, now, reason, "alignment")
-        near = inputs.position()
+            return self._refuse(memory, now, reason, Cause.ALIGNMENT)
+        near = memory.chosen[-1].posture if memory.chosen else inputs.position()
         try:
-            chosen = choose_reachable(estimate, self._motion, near=near, solve=self._solve)
+            chosen = choose_reachable(estimate, waypoint, near=near, solve=self._solve)
         except Refusal as refusal:
-            return self._refuse(memory, now, str(refusal), "IK")
-        opening = (
-            self._motion.opening_reached
-            if self._demonstrations is None
-            else self._demonstrations.opening(0)
-        )
-        steps = motion_steps(
-            chosen.X_WE,
-            self._motion,
-            waypoint=0,
-            first_sequence=memory.target.sequence + 1,
-            opening_reached=opening,
-            nominal_posture=chosen.posture,
-        )
-        memory = replace(memory, chosen=chosen, steps=steps, step=0, target=steps[0].target)
+            return self._refuse(memory, now, str(refusal), Cause.IK)
+        memory = replace(memory, chosen=(*memory.chosen, chosen))
         detail = (
             f"mode {chosen.mode + 1} of {len(estimate.poses)}, energy {chosen.energy:.3f}, "
             f"{seconds:.2f} s"
         )
-        return self._enter(memory, Phase.EXECUTE, now, detail)
+        return self._continue(memory, inputs, now, detail)
 
-    def _execute(self, memory: PolicyMemory, inputs: PolicyInputs, now: float) -> PolicyMemory:
+    def _start_move(self, memory: PolicyMemory, now: float, detail: str) -> PolicyMemory:
+        index = memory.followed
+        waypoint, chosen = self.motion.waypoints[index], memory.chosen[index]
+        opening = waypoint.opening_reached
+        if self._demonstrations is not None:
+            opening = self._demonstrations.opening(index)
+        steps = motion_steps(
+            chosen.X_WE,
+            waypoint,
+            first_sequence=memory.target.sequence + 1,
+            opening_reached=opening,
+            nominal_posture=chosen.posture,
+        )
+        memory = replace(memory, steps=steps, step=0, target=steps[0].target)
+        return self._enter(memory, Phase.MOVE, now, waypoint.name, detail)
+
+    def _move(self, memory: PolicyMemory, inputs: PolicyInputs, now: float) -> PolicyMemory:
         step = memory.steps[memory.step]
-        status = memory.status
-        if status.step != step.name:
-            memory = replace(memory, status=replace(status, step=step.name))
         follower = inputs.follower()
         if follower.sequence_reached < step.target.sequence:
-            return self._check_time(memory, inputs, now, self.config.execute_limit)
-        if step.waypoint is not None:
-            reached = (*memory.status.waypoints_reached, inputs.pose())
-            memory = replace(memory, status=replace(memory.status, waypoints_reached=reached))
+            return self._check_time(memory, inputs, now, self.config.move_limit)
+        status = memory.status
+        if step.at_waypoint:
+            status = replace(
+                status,
+                waypoints_reached=(*status.waypoints_reached, inputs.pose()),
+                times_reached=(*status.times_reached, now),
+            )
         index = memory.step + 1
         if index == len(memory.steps):
-            return self._enter(memory, Phase.DONE, now)
+            memory = replace(memory, status=status, followed=memory.followed + 1)
+            return self._continue(memory, inputs, now)
         steps = memory.steps
         if follower.touched:
             steps = moved_steps(steps, step.target.X_WE, inputs.pose())
@@ -321,29 +428,28 @@ class PolicyMachine:
             steps=steps,
             step=index,
             target=following.target,
-            status=replace(memory.status, step=following.name),
+            status=replace(status, step=following.name),
         )
 
     # Transitions
 
     def _enter(
-        self, memory: PolicyMemory, phase: Phase, now: float, detail: str = ""
+        self, memory: PolicyMemory, phase: Phase, now: float, subject: str = "", detail: str = ""
     ) -> PolicyMemory:
+        entry = PhaseEntry(time=now, phase=phase, subject=subject, detail=detail)
+        moves = phase in (Phase.PRESENT, Phase.MOVE)
         status = replace(
             memory.status,
             phase=phase,
-            step="",
-            timeline=(
-                *memory.status.timeline,
-                PhaseEntry(time=now, phase=phase, detail=detail),
-            ),
+            step=memory.steps[memory.step].name if moves else "",
+            timeline=(*memory.status.timeline, entry),
         )
         return replace(memory, status=status, phase_started=now)
 
     def _refuse(self, memory: PolicyMemory, now: float, reason: str, cause: Cause) -> PolicyMemory:
         """Nothing is under way: the arm rests at its last target."""
-        during = memory.status.phase.value
-        memory = self._enter(memory, Phase.REFUSED, now, reason)
+        during = f"{memory.status.phase.value} {memory.status.subject}".strip()
+        memory = self._enter(memory, Phase.REFUSED, now, detail=reason)
         status = replace(memory.status, reason=f"{during}: {reason}", cause=cause)
         return replace(memory, status=status)
 
@@ -351,7 +457,8 @@ class PolicyMachine:
         self, memory: PolicyMemory, inputs: PolicyInputs, now: float, reason: str, cause: Cause
     ) -> PolicyMemory:
         """A motion may be under way: the arm is held where it is, the hand as it is."""
-        during = memory.status.step or memory.status.phase.value
+        status = memory.status
+        during = status.step or f"{status.phase.value} {status.subject}".strip()
         opening = memory.target.opening_moving
         hold = EndEffectorTarget(
             sequence=memory.target.sequence + 1,
@@ -359,7 +466,7 @@ class PolicyMachine:
             opening_moving=opening,
             opening_reached=opening,
         )
-        memory = self._enter(memory, Phase.FAILED, now, reason)
+        memory = self._enter(memory, Phase.FAILED, now, detail=reason)
         status = replace(memory.status, reason=f"{during}: {reason}", cause=cause)
         return replace(memory, status=status, target=hold)
 
@@ -371,12 +478,6 @@ class PolicyMachine:
         follower = inputs.follower()
         reason = (
             f"not reached within {limit:g} s, {100 * follower.position_error:.1f} cm and "
-            f"{np.degrees(follower.rotation_error):.0f} deg are left"
+            f"{math.degrees(follower.rotation_error):.0f} deg are left"
         )
-        return self._fail(memory, inputs, now, reason, "time")
-
-
-def _cause(supervisor_reason: str) -> Cause:
-    """Torque and lag come from touching something, everything else from the commanded motion."""
-    touched = any(word in supervisor_reason for word in ("torque", "tracking error"))
-    return "contact" if touched else "IK"
+        return self._fail(memory, inputs, now, reason, Cause.TIME)

@@ -1,4 +1,4 @@
-"""The sequence of a policy, in pieces without ports: phases, motion around a waypoint, choices.
+"""What a task observes and how it moves around its waypoints; phases and choices of the policy.
 
 Everything here is a plain function or a frozen value, so that it can be tested without a diagram.
 """
@@ -6,14 +6,14 @@ Everything here is a plain function or a frozen value, so that it can be tested 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Literal
 
 import numpy as np
 from pydrake.math import RigidTransform
 
 from iga_drake.aligners.protocol import PoseEstimate
+from iga_drake.demonstrations.demonstration import Frame, ObservedRole
 from iga_drake.errors import IgaDrakeError
-from iga_drake.systems.messages import EndEffectorTarget
+from iga_drake.systems.messages import Cause, EndEffectorTarget
 
 
 class PolicyError(IgaDrakeError):
@@ -25,13 +25,12 @@ class Refusal(IgaDrakeError):
 
 
 class Phase(Enum):
-    """Where the policy is; the last three are final."""
+    """Where the policy is; the last three are final. The others may come several times."""
 
-    OBSERVE_TARGET = "observe target"
-    PRESENT_GRASPED = "present grasped"
-    OBSERVE_GRASPED = "observe grasped"
+    OBSERVE = "observe"
+    PRESENT = "present"
     INFER = "infer"
-    EXECUTE = "execute"
+    MOVE = "move"
     DONE = "done"
     REFUSED = "refused"
     FAILED = "failed"
@@ -42,16 +41,20 @@ class Phase(Enum):
         return self in (Phase.DONE, Phase.REFUSED, Phase.FAILED)
 
 
-Cause = Literal["", "perception", "alignment", "IK", "contact", "time"]
-
-
 @dataclass(frozen=True, kw_only=True)
 class PhaseEntry:
     """One line of the policy's timeline."""
 
     time: float  # s
     phase: Phase
+    # Name of the observation or the waypoint that the phase is about.
+    subject: str = ""
+    # What is known when the phase begins, in words.
     detail: str = ""
+
+    def __str__(self) -> str:
+        detail = f"  ({self.detail})" if self.detail else ""
+        return f"{self.time:6.2f} s  {self.phase.value} {self.subject}".rstrip() + detail
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,28 +67,53 @@ class PolicyStatus:
     # Why the policy refused or failed; empty otherwise.
     reason: str = ""
     # Kind of that reason.
-    cause: Cause = ""
+    cause: Cause | None = None
     # Name of the motion step under way.
     step: str = ""
     # Measured X_WE at each waypoint reached so far, before the hand acted there.
     waypoints_reached: tuple[RigidTransform, ...] = ()
+    # Simulated time (s) at which each of them was reached.
+    times_reached: tuple[float, ...] = ()
     # Wall-clock time of each inference so far (s).
     inference_seconds: tuple[float, ...] = ()
 
+    @property
+    def subject(self) -> str:
+        """The observation or waypoint that the present phase is about."""
+        return self.timeline[-1].subject
+
 
 @dataclass(frozen=True, kw_only=True)
-class TaskMotion:
-    """How a task moves around its inferred waypoint. Nothing here depends on the object."""
+class ObservationPlan:
+    """One cloud that a task needs, and when and how it is seen."""
 
-    # Whether the grasped object is presented to the cameras (else: the gripper's cloud is used).
-    observes_grasped: bool
-    # X_WE at which it is presented, and the joint angles (rad) near which to be there.
+    # The name by which waypoints, here and in demonstrations, relate it.
+    name: str
+    # Which of the fused clouds it is; "gripper": the points of the hand's own model.
+    role: ObservedRole
+    # Frame in which it is kept: "E" for what moves with the hand, "W" for what stands still.
+    frame: Frame
+    # Number of waypoints that were followed before it is observed.
+    after: int = 0
+    # X_WE at which the hand shows it to the cameras (None: it is seen from where the arm is), and
+    # joint angles (7,) (rad) near which to be there.
     present: RigidTransform | None = None
     present_posture: np.ndarray | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaypointMotion:
+    """How a task moves around one inferred waypoint. Nothing here depends on the object."""
+
+    # The waypoint's name in the demonstrations.
+    name: str
+    # Names of the observations that it relates.
+    grasped: str
+    target: str
     # Offset (m) of the pose before the waypoint: along the axes of E there, plus along those of W.
     before_E: tuple[float, float, float] = (0.0, 0.0, 0.0)
     before_W: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    # Opening (m) commanded on the way, and at the waypoint.
+    # Opening (m) commanded on the way, and at the waypoint where no demonstration says it.
     opening_approach: float
     opening_reached: float
     # Time (s) given to the hand at the waypoint.
@@ -102,14 +130,48 @@ class TaskMotion:
     symmetries_E: tuple[RigidTransform, ...] = (RigidTransform(),)
 
     def __post_init__(self) -> None:
-        if self.observes_grasped and self.present is None:
-            raise PolicyError("TaskMotion.present: None found, a pose expected (observes_grasped)")
         if not self.symmetries_E:
-            raise PolicyError("TaskMotion.symmetries_E: empty, the identity at least expected")
+            raise PolicyError(
+                f"waypoint '{self.name}': symmetries_E is empty, the identity at least expected"
+            )
         if self.contact_force is not None and not self.contact_force > 0:
             raise PolicyError(
-                f"TaskMotion.contact_force: {self.contact_force} N found, it has to be > 0"
+                f"waypoint '{self.name}': contact_force {self.contact_force} N found, it has to "
+                "be > 0"
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskMotion:
+    """All that a task observes, and its waypoints in the order in which they are followed."""
+
+    observations: tuple[ObservationPlan, ...]
+    waypoints: tuple[WaypointMotion, ...]
+
+    def __post_init__(self) -> None:
+        plans = {plan.name: plan for plan in self.observations}
+        names = [waypoint.name for waypoint in self.waypoints]
+        if not names or len(set(names)) < len(names) or len(plans) < len(self.observations):
+            raise PolicyError(
+                f"TaskMotion: waypoints {names} of observations "
+                f"{[plan.name for plan in self.observations]}: at least one waypoint, and every "
+                "name once, expected"
+            )
+        for index, waypoint in enumerate(self.waypoints):
+            for role, frame in (("grasped", "E"), ("target", "W")):
+                name = getattr(waypoint, role)
+                plan = plans.get(name)
+                if plan is None or plan.frame != frame or plan.after > index:
+                    raise PolicyError(
+                        f"TaskMotion: waypoint '{waypoint.name}' relates the {role} '{name}': an "
+                        f"observation in frame {frame} made after at most {index} waypoints "
+                        f"expected, {plan} found"
+                    )
+
+    @property
+    def relations(self) -> tuple[tuple[str, str, str], ...]:
+        """Name, grasped and target observation of each waypoint, as demonstrations give them."""
+        return tuple((w.name, w.grasped, w.target) for w in self.waypoints)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,8 +180,8 @@ class MotionStep:
 
     name: str
     target: EndEffectorTarget
-    # Index of the waypoint whose measured pose is noted once this step is reached.
-    waypoint: int | None = None
+    # Whether this step's pose is the waypoint: the measured pose is noted once it is reached.
+    at_waypoint: bool = False
 
 
 def offset_pose(X_WE: RigidTransform, p_E: Sequence[float], p_W: Sequence[float]) -> RigidTransform:
@@ -130,9 +192,8 @@ def offset_pose(X_WE: RigidTransform, p_E: Sequence[float], p_W: Sequence[float]
 
 def motion_steps(
     X_WE: RigidTransform,
-    motion: TaskMotion,
+    motion: WaypointMotion,
     *,
-    waypoint: int,
     first_sequence: int,
     opening_reached: float,
     nominal_posture: np.ndarray | None = None,
@@ -141,16 +202,16 @@ def motion_steps(
     before = offset_pose(X_WE, motion.before_E, motion.before_W)
     after = offset_pose(X_WE, motion.after_E, motion.after_W)
     approach = motion.opening_approach
-    # name, pose, opening moving, opening reached, settling time, speed, waypoint noted
+    # name, pose, opening moving, opening reached, settling time, speed
     plan = [
-        ("before waypoint", before, approach, approach, 0.0, 1.0, None),
-        ("waypoint", X_WE, approach, approach, 0.2, motion.speed_scale, waypoint),
-        ("hand", X_WE, opening_reached, opening_reached, motion.settle, 1.0, None),
-        ("after waypoint", after, opening_reached, opening_reached, 0.2, motion.speed_scale, None),
+        ("before", before, approach, approach, 0.0, 1.0),
+        ("at", X_WE, approach, approach, 0.2, motion.speed_scale),
+        ("hand at", X_WE, opening_reached, opening_reached, motion.settle, 1.0),
+        ("after", after, opening_reached, opening_reached, 0.2, motion.speed_scale),
     ]
     return tuple(
         MotionStep(
-            name=name,
+            name=f"{name} {motion.name}",
             target=EndEffectorTarget(
                 sequence=first_sequence + index,
                 X_WE=pose,
@@ -159,11 +220,11 @@ def motion_steps(
                 settle=settle,
                 speed_scale=speed,
                 nominal_posture=nominal_posture,
-                contact_force=None if noted is None else motion.contact_force,
+                contact_force=motion.contact_force if name == "at" else None,
             ),
-            waypoint=noted,
+            at_waypoint=name == "at",
         )
-        for index, (name, pose, moving, reached, settle, speed, noted) in enumerate(plan)
+        for index, (name, pose, moving, reached, settle, speed) in enumerate(plan)
     )
 
 
@@ -177,26 +238,26 @@ def moved_steps(
     )
 
 
-def check_observation(points: np.ndarray, role: str, *, minimum: int) -> np.ndarray:
+def check_observation(points: np.ndarray, name: str, *, minimum: int) -> np.ndarray:
     """`points` (P, 3) without invalid ones, or a `Refusal` that says what the cameras delivered."""
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     finite = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         raise Refusal(
-            f"{role} cloud is empty: no camera sees the {role} object; move it into the work area"
+            f"the cloud of '{name}' is empty: no camera sees it; move it into the work area"
         )
     if len(finite) < minimum:
         bad = len(points) - len(finite)
         raise Refusal(
-            f"{role} cloud has {len(finite)} usable points ({bad} are NaN or infinite), at least "
-            f"{minimum} are needed: is the {role} object in view of the cameras?"
+            f"the cloud of '{name}' has {len(finite)} usable points ({bad} are NaN or infinite), "
+            f"at least {minimum} are needed: is it in view of the cameras?"
         )
     return finite
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReachablePose:
-    """The pose that the policy settles on."""
+    """The pose that the policy settles on for one waypoint."""
 
     X_WE: RigidTransform
     posture: np.ndarray  # (7,) rad, at the waypoint
@@ -207,7 +268,7 @@ class ReachablePose:
 
 def choose_reachable(
     estimate: PoseEstimate,
-    motion: TaskMotion,
+    motion: WaypointMotion,
     *,
     near: np.ndarray,
     solve: Callable[[RigidTransform, np.ndarray], np.ndarray | None],

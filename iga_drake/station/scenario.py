@@ -5,9 +5,12 @@ states only what differs from it. SI units throughout (m, rad, s, N); W is the w
 """
 
 import dataclasses
+import hashlib
+import json
 import math
 import types
 import typing
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,7 +18,18 @@ import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load, yaml_load_typed
 from pydrake.multibody.plant import MultibodyPlantConfig
 
-from iga_drake.errors import IgaDrakeError
+from iga_drake.errors import IgaDrakeError, check_range
+from iga_drake.paths import diagrams_dir
+from iga_drake.planning.planning_robot import PlanningConfig
+from iga_drake.policy.machine import PolicyConfig
+from iga_drake.station.cameras.kinds import camera_type
+from iga_drake.station.cameras.rgbd import LookAt, RgbdCamera
+from iga_drake.systems.differential_ik import DifferentialIkConfig
+from iga_drake.systems.fusion import FusionConfig
+from iga_drake.systems.ports import PANDA_JOINTS
+from iga_drake.systems.supervisor import SupervisorConfig
+from iga_drake.systems.waypoint_follower import WaypointFollowerConfig
+from iga_drake.viewing.meshcat import Visualization
 
 
 class ScenarioError(IgaDrakeError):
@@ -44,6 +58,15 @@ class Table:
     color: list[float] = field(default_factory=lambda: [0.55, 0.45, 0.36])
 
 
+    def check(self, where: str) -> None:
+        """Raises `ConfigError` for a value out of range."""
+        for name, length in (("size", 3), ("center", 2), ("color", 3)):
+            value = getattr(self, name)
+            check_range(len(value) == length, f"{where}.{name}", value, f"{length} numbers")
+        check_range(min(self.size) > 0, f"{where}.size", self.size, "3 numbers > 0")
+        check_range(self.friction >= 0, f"{where}.friction", self.friction, ">= 0")
+
+
 @dataclass
 class Panda:
     """The robot in simulation."""
@@ -52,140 +75,24 @@ class Panda:
     # `visuals`), or "auto": primitives for the cameras, so that perception is the same on every
     # machine, and meshes for viewers where they can be had. Collisions are the same in all.
     visuals: str = "auto"
+    # Time constant (s) with which a joint follows its command, and speed (m/s) of the opening.
+    time_constant: float = 0.01
+    opening_speed: float = 0.1
+
+    def check(self, where: str) -> None:
+        """Raises `ConfigError` for a value out of range."""
+        looks = ("auto", "meshes", "primitives")
+        check_range(self.visuals in looks, f"{where}.visuals", self.visuals, ", ".join(looks))
+        for name in ("time_constant", "opening_speed"):
+            check_range(getattr(self, name) > 0, f"{where}.{name}", getattr(self, name), "> 0")
 
 
-@dataclass
-class LookAt:
-    """A camera pose given by where it stands and what it looks at; image "up" is W's +z."""
-
-    # Origin of the optical frame C in W (m).
-    position: list[float] = field(default_factory=lambda: [1.25, 0.0, 0.8])
-    # Point on the optical axis (m, in W); neither `position` itself nor straight above or below it.
-    target: list[float] = field(default_factory=lambda: [0.5, 0.0, 0.18])
-
-
-@dataclass
-class Pose:
-    """A camera pose X_WC given outright; C is optical: z forward, x right, y down."""
-
-    # p_WC (m).
-    translation: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    # Roll, pitch, yaw of R_WC (rad), Drake's convention.
-    rpy: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-
-
-@dataclass
-class Intrinsics:
-    """A pinhole without distortion; the colour, depth and label images share it.
-
-    The defaults are a RealSense D415's: the data sheet's colour field of view of 69.4 x 42.5 deg
-    at 1920x1080, cropped to 4:3 and scaled to 640x480, gives 616 px.
-    """
-
-    # Image size (px), > 0.
-    width: int = 640
-    height: int = 480
-    # Focal lengths (px), > 0.
-    fx: float = 616.0
-    fy: float = 616.0
-    # Principal point (px), inside the image; the centre of the first pixel is (0, 0).
-    cx: float = 319.5
-    cy: float = 239.5
-
-
-@dataclass
-class DepthNoise:
-    """How a depth image gets worse than the rendered one; formulas in `camera_noise`."""
-
-    # Gaussian noise whose deviation grows with the square of the distance.
-    gaussian: bool = True
-    # Deviation at a distance of 1 m (m), >= 0.
-    sigma_at_one_metre: float = 0.0024
-    # Pixels beside a jump in depth get lost.
-    dropouts: bool = True
-    # Chance that such a pixel is lost, in [0, 1].
-    dropout_probability: float = 0.5
-    # A jump is a difference between neighbours above this (m), > 0.
-    dropout_jump: float = 0.02
-    # Depth comes in whole steps.
-    quantisation: bool = True
-    # The step (m), > 0.
-    quantisation_step: float = 0.001
-    # Time for which the noise of one image stays the same: one over the frame rate (s), > 0.
-    frame_period: float = 1.0 / 30.0
-
-
-@dataclass
-class CalibrationError:
-    """How far the exported camera pose is from the true one."""
-
-    # Whether there is an error at all.
-    enabled: bool = True
-    # Every point of the work area is displaced by at least and at most this (m),
-    # 0 <= minimum <= maximum. Drawn once for a seed.
-    minimum: float = 0.002
-    maximum: float = 0.005
-    # Angle of the rotation part (rad), >= 0; `rotation * radius` at most (maximum - minimum) / 2.
-    rotation: float = 0.002
-    # The work area is the ball around this point of W (m), the rotation's pivot...
-    center: list[float] = field(default_factory=lambda: [0.5, 0.0, 0.15])
-    # ...with this radius (m), > 0.
-    radius: float = 0.35
-
-
-@dataclass
-class Camera:
-    """One fixed RGB-D camera."""
-
-    # Where it stands: `!LookAt {position, target}` (default) or `!Pose {translation, rpy}`.
-    pose: LookAt | Pose = field(default_factory=LookAt)
-    intrinsics: Intrinsics = field(default_factory=Intrinsics)
-    # Range of valid depth (m), 0 < near < far; a D415 measures from about 0.45 m at full
-    # resolution and 0.3 m at this one.
-    near: float = 0.3
-    far: float = 3.0
-    noise: DepthNoise = field(default_factory=DepthNoise)
-    calibration: CalibrationError = field(default_factory=CalibrationError)
-
-
-def _cameras() -> dict[str, Camera]:
+def _cameras() -> dict[str, RgbdCamera]:
     return {
-        "camera_0": Camera(pose=LookAt(position=[1.25, 0.0, 0.8], target=[0.5, 0.0, 0.18])),
-        "camera_1": Camera(pose=LookAt(position=[0.25, 0.95, 0.8], target=[0.5, 0.0, 0.15])),
-        "camera_2": Camera(pose=LookAt(position=[0.25, -0.95, 0.8], target=[0.5, 0.0, 0.15])),
+        "camera_0": RgbdCamera(pose=LookAt(position=[1.25, 0.0, 0.8], target=[0.5, 0.0, 0.18])),
+        "camera_1": RgbdCamera(pose=LookAt(position=[0.25, 0.95, 0.8], target=[0.5, 0.0, 0.15])),
+        "camera_2": RgbdCamera(pose=LookAt(position=[0.25, -0.95, 0.8], target=[0.5, 0.0, 0.15])),
     }
-
-
-@dataclass
-class Fusion:
-    """How depth images become clouds; see `iga_drake.systems.fusion.PointCloudFusion`."""
-
-    # Edge length of a voxel (m), > 0.
-    voxel_size: float = 0.005
-    # Corners of the box in W outside of which points are dropped (m), lower < upper.
-    crop_lower: list[float] = field(default_factory=lambda: [0.1, -0.6, -0.02])
-    crop_upper: list[float] = field(default_factory=lambda: [0.95, 0.6, 0.8])
-    # Pixels nearer than this to a jump in depth or label are dropped (px), >= 0.
-    erosion: int = 1
-    # A jump is a difference between neighbours above this (m), > 0.
-    depth_jump: float = 0.02
-    # Connected groups of fewer voxels than this are dropped, >= 1 (1: none is dropped).
-    min_cluster: int = 8
-
-
-@dataclass
-class Visualization:
-    """What a person may look at while it runs."""
-
-    # Starts a Meshcat server (on this machine only).
-    meshcat: bool = False
-    # Its port; null takes the first free one from 7000 on.
-    port: int | None = None
-    # Time between two updates of the scene (s), > 0.
-    publish_period: float = 1.0 / 32.0
-    # Also shows collision geometry (hidden at first) and contact forces.
-    proximity: bool = True
-    contacts: bool = False
 
 
 @dataclass
@@ -206,37 +113,6 @@ class Aligner:
     name: str = "iga"
     # What that aligner lets one choose, as numbers or text; it refuses names it doesn't know.
     options: dict[str, float | str] = field(default_factory=dict)
-    # Probability, in [0, 1], that the demonstrations show such objects at all, below which the
-    # policy refuses; 0 refuses nothing. Aligners that can't tell are not asked.
-    minimum_familiarity: float = 0.0
-
-
-@dataclass
-class Control:
-    """How the arm follows waypoints."""
-
-    # Speed of the end-effector frame's origin (m/s), > 0.
-    linear_speed: float = 0.2
-    # Angular speed of the end-effector frame (rad/s), > 0.
-    angular_speed: float = 0.8
-    # Fraction of the robot's joint velocity limits that may be used, in (0, 1].
-    joint_speed_scale: float = 0.9
-    # Time between two commands to the arm (s), > 0.
-    period: float = 0.01
-
-
-@dataclass
-class PhaseTimeLimits:
-    """Time after which a phase of the policy has failed (s), each > 0.
-
-    Simulated time, but for `infer`: that is wall-clock time.
-    """
-
-    observe_target: float = 20.0
-    present: float = 20.0
-    observe_grasped: float = 10.0
-    infer: float = 60.0
-    execute: float = 60.0
 
 
 @dataclass
@@ -258,20 +134,27 @@ class Seeds:
 class Scenario:
     """Everything that a diagram is built from, apart from the seeded scene."""
 
+    # Name in the station registry of `iga_drake.station`.
+    station: str = "simulated"
     # Physics: time step (s), contact model and solver.
     plant: MultibodyPlantConfig = field(default_factory=_plant)
     panda: Panda = field(default_factory=Panda)
     table: Table = field(default_factory=Table)
     # Name -> camera, at least one. A file that has this section states all cameras it wants.
-    cameras: dict[str, Camera] = field(default_factory=_cameras)
-    fusion: Fusion = field(default_factory=Fusion)
-    visualization: Visualization = field(default_factory=Visualization)
+    cameras: dict[str, camera_type()] = field(default_factory=_cameras)  # type: ignore[valid-type]
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    planning: PlanningConfig = field(default_factory=PlanningConfig)
+    control: WaypointFollowerConfig = field(default_factory=WaypointFollowerConfig)
+    differential_ik: DifferentialIkConfig = field(default_factory=DifferentialIkConfig)
+    supervisor: SupervisorConfig = field(default_factory=SupervisorConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
     task: Task = field(default_factory=Task)
     aligner: Aligner = field(default_factory=Aligner)
     # Folder with the demonstrations; a relative path starts at `models/`.
     demonstrations: str = "demonstrations/grasp"
-    control: Control = field(default_factory=Control)
-    time_limits: PhaseTimeLimits = field(default_factory=PhaseTimeLimits)
+    # How many of them, from the first on, make up the aligner's context; all where there are fewer.
+    context_size: int = 3
+    visualization: Visualization = field(default_factory=Visualization)
     seeds: Seeds = field(default_factory=Seeds)
 
     @property
@@ -279,41 +162,108 @@ class Scenario:
         """The cameras in the file's order."""
         return tuple(self.cameras)
 
+    @property
+    def digest(self) -> str:
+        """The same for scenarios that say the same, whatever their files are called."""
+        return hashlib.sha256(self.to_yaml().encode()).hexdigest()[:16]
+
     def to_yaml(self) -> str:
         """The whole scenario, defaults included, as text that `load_scenario` reads back."""
         return yaml_dump_typed(self, schema=Scenario)
 
 
-def load_scenario(path: str | Path) -> Scenario:
-    """Reads a scenario file.
+def load_scenario(
+    path: str | Path, *overlays: str | Path, overrides: Sequence[str] = ()
+) -> Scenario:
+    """Reads a scenario file, then further files and settings on top of it.
 
-    Raises `ScenarioError`, naming the file and the key, for a missing file, broken YAML, an unknown
-    key (the valid ones are listed), a value of a wrong type and a value out of its range.
+    Args:
+      path: a file, or the name of one in `diagrams/`, with or without ".yaml".
+      overlays: files that state what differs from those before them.
+      overrides: settings "key.path=value", the value as in YAML; the last word.
+
+    Raises `ScenarioError`, naming the file and the key, for a missing file, broken YAML, a key that
+    is unknown (the valid ones are listed) or stated twice, a value of a wrong type and a value out
+    of its range.
     """
-    path = Path(path)
+    scenario = Scenario()
+    for file in (path, *overlays):
+        file = scenario_path(file)
+        try:
+            text = file.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as e:
+            raise ScenarioError(
+                f"{file}: scenario can't be read ({e}): give the path of a .yaml"
+            ) from e
+        scenario = _layered(scenario, text, str(file))
+    for override in overrides:
+        scenario = _layered(scenario, _override_text(override), override, keep_maps=True)
+    return scenario
+
+
+def scenario_path(name: str | Path) -> Path:
+    """`name` as a path, or as the name of a file in `diagrams/`, with or without ".yaml"."""
+    path = Path(name)
+    named = diagrams_dir() / f"{path.name.removesuffix('.yaml')}.yaml"
+    if not path.is_file() and path.name == str(name) and named.is_file():
+        return named
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in diagrams_dir().glob("*.yaml")))
+        raise ScenarioError(f"scenario {name}: no such file; name a YAML file or one of: {known}")
+    return path
+
+
+def _override_text(override: str) -> str:
+    """"a.b=c" as YAML."""
+    key, found, value = override.partition("=")
+    names = key.strip().split(".")
+    if not found or not all(names):
+        raise ScenarioError(f"{override}: expected key.path=value, such as control.linear_speed=0.1")
+    braces = "".join(f"{{{json.dumps(name)}: " for name in names)
+    return f"{braces}{value}{'}' * len(names)}"
+
+
+def _layered(scenario: Scenario, text: str, where: str, *, keep_maps: bool = False) -> Scenario:
+    """`scenario` with what `text` (YAML) says on top; `keep_maps`: maps are added to, not replaced."""
     try:
-        text = path.read_text(encoding="utf-8") or "{}"
-    except (OSError, UnicodeDecodeError) as e:
-        raise ScenarioError(
-            f"{path}: scenario can't be read ({e}): give the path of a .yaml"
-        ) from e
-    try:
+        _check_keys(yaml.compose(text, Loader=yaml.SafeLoader), "")
         data = yaml_load(data=text, private=True)
     except yaml.YAMLError as e:
-        raise ScenarioError(f"{path}: not valid YAML: {e}") from e
+        raise ScenarioError(f"{where}: not valid YAML: {e}") from e
+    except ScenarioError as e:
+        raise ScenarioError(f"{where}: {e}") from None
     if data is None:
-        data, text = {}, "{}"
+        return scenario
     try:
         _check_node(Scenario, data, "")
-        scenario = yaml_load_typed(
-            schema=Scenario, data=text, defaults=Scenario(), retain_map_defaults=False
+        layered = yaml_load_typed(
+            schema=Scenario, data=text, defaults=scenario, retain_map_defaults=keep_maps
         )
-        _check_values(scenario)
-    except ScenarioError as e:
-        raise ScenarioError(f"{path}: {e}") from None
+        _check_values(layered)
+    except IgaDrakeError as e:
+        raise ScenarioError(f"{where}: {e}") from None
     except Exception as e:  # yaml_load_typed raises many kinds
-        raise ScenarioError(f"{path}: {e}") from e
-    return scenario
+        raise ScenarioError(f"{where}: {e}") from e
+    return layered
+
+
+def _check_keys(node: yaml.Node | None, where: str) -> None:
+    """Raises `ScenarioError` where a mapping states a key twice: YAML itself takes the last."""
+    if isinstance(node, yaml.MappingNode):
+        lines: dict[str, int] = {}
+        for key, value in node.value:
+            name = str(key.value)
+            line = key.start_mark.line + 1
+            if name in lines:
+                raise ScenarioError(
+                    f"key '{f'{where}.{name}' if where else name}' is stated twice, in lines "
+                    f"{lines[name]} and {line}: remove one"
+                )
+            lines[name] = line
+            _check_keys(value, f"{where}.{name}" if where else name)
+    elif isinstance(node, yaml.SequenceNode):
+        for i, item in enumerate(node.value):
+            _check_keys(item, f"{where}[{i}]")
 
 
 def _fields(schema: type) -> dict[str, typing.Any] | None:
@@ -381,7 +331,6 @@ def _wrong_type(where: str, expected: str, node: typing.Any) -> ScenarioError:
     return ScenarioError(f"{where}: expected {expected}, found {type(node).__name__} {node!r}")
 
 
-_PANDA_VISUALS = ("auto", "meshes", "primitives")
 # Drake itself looks at these names only when the plant is built.
 _PLANT_CHOICES = {
     "contact_model": ("point", "hydroelastic", "hydroelastic_with_fallback"),
@@ -391,76 +340,24 @@ _PLANT_CHOICES = {
 
 
 def _check_values(s: Scenario) -> None:
-    """Ranges and lengths; types are right already."""
-
-    def need(ok: bool, where: str, value: typing.Any, allowed: str) -> None:
-        if not ok:
-            raise ScenarioError(f"{where}: {value!r} is out of range; allowed: {allowed}")
-
-    def vector(value: list[float], where: str, size: int = 3) -> None:
-        need(len(value) == size, where, value, f"{size} numbers")
-
-    def positive(owner: typing.Any, where: str, *names: str) -> None:
-        for name in names:
-            need(getattr(owner, name) > 0, f"{where}.{name}", getattr(owner, name), "> 0")
-
-    positive(s.plant, "plant", "time_step")
+    """Raises `ConfigError` for ranges and lengths; types are right already."""
+    check_range(s.plant.time_step > 0, "plant.time_step", s.plant.time_step, "> 0")
     for key, valid in _PLANT_CHOICES.items():
         value = getattr(s.plant, key)
-        need(value in valid, f"plant.{key}", value, ", ".join(valid))
-    look = s.panda.visuals
-    need(look in _PANDA_VISUALS, "panda.visuals", look, ", ".join(_PANDA_VISUALS))
-    vector(s.table.size, "table.size")
-    need(min(s.table.size) > 0, "table.size", s.table.size, "3 numbers > 0")
-    vector(s.table.center, "table.center", 2)
-    vector(s.table.color, "table.color")
-    need(s.table.friction >= 0, "table.friction", s.table.friction, ">= 0")
-    need(len(s.cameras) > 0, "cameras", s.cameras, "at least one camera")
+        check_range(value in valid, f"plant.{key}", value, ", ".join(valid))
+    s.panda.check("panda")
+    s.table.check("table")
+    check_range(len(s.cameras) > 0, "cameras", s.cameras, "at least one camera")
     for name, camera in s.cameras.items():
-        at = f"cameras.{name}"
-        pose = camera.pose
-        if isinstance(pose, LookAt):
-            vector(pose.position, f"{at}.pose.position")
-            vector(pose.target, f"{at}.pose.target")
-            sideways = math.dist(pose.position[:2], pose.target[:2])
-            need(sideways > 1e-6, f"{at}.pose.target", pose.target, "not above or below position")
-        else:
-            vector(pose.translation, f"{at}.pose.translation")
-            vector(pose.rpy, f"{at}.pose.rpy")
-        k = camera.intrinsics
-        positive(k, f"{at}.intrinsics", "width", "height", "fx", "fy")
-        need(0 < k.cx < k.width, f"{at}.intrinsics.cx", k.cx, "inside the image")
-        need(0 < k.cy < k.height, f"{at}.intrinsics.cy", k.cy, "inside the image")
-        need(0 < camera.near < camera.far, f"{at}.near", camera.near, "0 < near < far")
-        n, c = camera.noise, camera.calibration
-        need(n.sigma_at_one_metre >= 0, f"{at}.noise.sigma_at_one_metre", n, ">= 0")
-        p = n.dropout_probability
-        need(0 <= p <= 1, f"{at}.noise.dropout_probability", p, "0..1")
-        positive(n, f"{at}.noise", "dropout_jump", "quantisation_step", "frame_period")
-        vector(c.center, f"{at}.calibration.center")
-        positive(c, f"{at}.calibration", "radius")
-        need(0 <= c.minimum <= c.maximum, f"{at}.calibration.minimum", c.minimum, "0..maximum")
-        most = (c.maximum - c.minimum) / 2 / c.radius
-        need(
-            0 <= c.rotation <= most + 1e-12,
-            f"{at}.calibration.rotation",
-            c.rotation,
-            f"0..(maximum - minimum) / (2 radius) = {most:.4g} rad",
-        )
-    f = s.fusion
-    positive(f, "fusion", "voxel_size", "depth_jump", "min_cluster")
-    need(f.erosion >= 0, "fusion.erosion", f.erosion, ">= 0")
-    vector(f.crop_lower, "fusion.crop_lower")
-    vector(f.crop_upper, "fusion.crop_upper")
-    ordered = all(lo < up for lo, up in zip(f.crop_lower, f.crop_upper, strict=True))
-    need(ordered, "fusion.crop_lower", f.crop_lower, f"below crop_upper = {f.crop_upper}")
-    positive(s.visualization, "visualization", "publish_period")
-    positive(s.task, "task", "time_limit")
-    least = s.aligner.minimum_familiarity
-    need(0 <= least <= 1, "aligner.minimum_familiarity", least, "0..1")
-    positive(s.control, "control", "linear_speed", "angular_speed", "joint_speed_scale", "period")
-    scale = s.control.joint_speed_scale
-    need(scale <= 1, "control.joint_speed_scale", scale, "0..1")
-    positive(s.time_limits, "time_limits", *vars(s.time_limits))
+        camera.check(f"cameras.{name}")
+    s.fusion.check("fusion")
+    s.planning.check("planning")
+    s.control.check("control")
+    s.differential_ik.check(s.control.period, "differential_ik")
+    s.supervisor.check(PANDA_JOINTS, "supervisor")
+    s.policy.check("policy")
+    s.visualization.check("visualization")
+    check_range(s.task.time_limit > 0, "task.time_limit", s.task.time_limit, "> 0")
+    check_range(s.context_size > 0, "context_size", s.context_size, "> 0")
     for name, seed in vars(s.seeds).items():
-        need(seed >= 0, f"seeds.{name}", seed, ">= 0")
+        check_range(seed >= 0, f"seeds.{name}", seed, ">= 0")

@@ -1,6 +1,7 @@
 """Differential inverse kinematics: a moving end-effector pose becomes joint angles."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
@@ -8,22 +9,20 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.inverse_kinematics import DifferentialInverseKinematicsSystem
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.planning import DofMask, JointLimits
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
-from pydrake.systems.primitives import AffineSystem, BusCreator, DiscreteTimeIntegrator, MatrixGain
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import AffineSystem, BusCreator, MatrixGain
 
-from iga_drake.errors import IgaDrakeError
+from iga_drake.errors import check_range
 from iga_drake.planning.planning_robot import PlanningRobot
 
 _System = DifferentialInverseKinematicsSystem
 _WISH = -0.05  # m or rad
 
 
-@dataclass(frozen=True)
+@dataclass
 class DifferentialIkConfig:
     """How fast and how close to its limits the arm may move."""
 
-    # Period of the commands (s).
-    time_step: float = 0.005
     # Time (s) over which the solver looks ahead: a pose error is left to decay at this time
     # constant, and a clearance or a step too far likewise.
     horizon: float = 0.03
@@ -42,17 +41,56 @@ class DifferentialIkConfig:
     # Weight of the pose error against the posture.
     pose_weight: float = 100.0
 
-    def __post_init__(self) -> None:
-        if not 0.0 < self.velocity_scale <= 1.0:
-            raise IgaDrakeError(
-                f"DifferentialIkConfig.velocity_scale is {self.velocity_scale}: give a value in "
-                "(0, 1]"
-            )
-        if not 0.0 < self.time_step <= self.horizon:
-            raise IgaDrakeError(
-                f"DifferentialIkConfig: time_step {self.time_step} s has to be positive and at "
-                f"most the horizon, {self.horizon} s"
-            )
+    def check(self, period: float, where: str = "differential_ik") -> None:
+        """Raises `ConfigError` for a value out of range; `period` (s) is that of the commands."""
+        for name, value in vars(self).items():
+            check_range(value > 0, f"{where}.{name}", value, "> 0")
+        scale = self.velocity_scale
+        check_range(scale <= 1, f"{where}.velocity_scale", scale, "above 0, at most 1")
+        least = f"at least the period of the commands, {period:g} s"
+        check_range(self.horizon >= period, f"{where}.horizon", self.horizon, least)
+
+
+class JointIntegrator(LeafSystem):
+    """Integrates joint velocities from where the joints are measured at the first update on.
+
+    .. pydrake_system::
+
+        name: JointIntegrator
+        input_ports:
+        - velocity
+        - position_measured
+        output_ports:
+        - position
+
+    - `velocity` (N, rad/s), `position_measured` (N, rad).
+    - `position` (N, rad): the integral; the measured position before the first update.
+    """
+
+    def __init__(self, joints: int, period: float) -> None:
+        super().__init__()
+        self._period = period
+        self._velocity_input = self.DeclareVectorInputPort("velocity", joints)
+        self._measured_input = self.DeclareVectorInputPort("position_measured", joints)
+        self._state = self.DeclareDiscreteState(np.full(joints, np.nan))  # NaN: not begun
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclareVectorOutputPort(
+            "position",
+            joints,
+            self._calc_position,
+            {self.discrete_state_ticket(self._state), self._measured_input.ticket()},
+        )
+
+    def _position(self, context: Context) -> np.ndarray:
+        position = context.get_discrete_state_vector().value()
+        return position if np.isfinite(position).all() else self._measured_input.Eval(context)
+
+    def _update(self, context: Context, values: Any) -> None:
+        step = self._period * self._velocity_input.Eval(context)
+        values.set_value(self._state, self._position(context) + step)
+
+    def _calc_position(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._position(context))
 
 
 class DifferentialIk(Diagram):
@@ -64,25 +102,30 @@ class DifferentialIk(Diagram):
         input_ports:
         - desired_pose
         - nominal_posture
+        - position_measured
         output_ports:
         - position
         - velocity
 
     - `desired_pose` (RigidTransform): X_WE that the end effector should have now.
     - `nominal_posture` (N, rad): where the null space is pulled.
-    - `position` (N, rad): commanded joint angles, integrated in discrete state.
+    - `position_measured` (N, rad): where the commands start.
+    - `position` (N, rad): commanded joint angles, integrated in discrete state from the measured
+      ones on.
     - `velocity` (N, rad/s): the commanded joint velocities behind them.
 
     The commands respect the joints' position and velocity limits and keep links apart from each
     other and from the table by the robot's safety distance; where these forbid the desired motion,
-    the arm goes as far as they allow and stays there. Call `set_initial_position` before
-    simulating.
+    the arm goes as far as they allow and stays there.
     """
 
-    def __init__(self, robot: PlanningRobot, config: DifferentialIkConfig | None = None) -> None:
+    def __init__(
+        self, robot: PlanningRobot, config: DifferentialIkConfig | None = None, *, period: float
+    ) -> None:
+        """`period` (s) of the commands. Raises `ConfigError`."""
         super().__init__()
         config = config or DifferentialIkConfig()
-        self._robot = robot
+        config.check(period, "DifferentialIkConfig")
         checker, frame = robot.checker, robot.frame_E.scoped_name().get_full()
         speed = np.repeat([config.angular_velocity, config.linear_velocity], 3)
 
@@ -146,9 +189,10 @@ class DifferentialIk(Diagram):
                 Vd_TG_limit=SpatialVelocity(speed),
             ),
         )
-        self._integrator = builder.AddNamedSystem(
-            "integrator", DiscreteTimeIntegrator(len(robot.indices), config.time_step)
+        integrator = builder.AddNamedSystem(
+            "integrator", JointIntegrator(len(robot.indices), period)
         )
+        builder.ExportInput(integrator.GetInputPort("position_measured"), "position_measured")
 
         poses = builder.AddNamedSystem("poses", BusCreator())
         pose_input = poses.DeclareAbstractInputPort(frame, Value(RigidTransform()))
@@ -161,7 +205,7 @@ class DifferentialIk(Diagram):
         others = robot.full(np.zeros(len(moving)))
         wished = others + _WISH * (1.0 - moves)
         for port, source, offset in (
-            ("position", self._integrator, others),
+            ("position", integrator, others),
             ("nominal_posture", None, wished),
         ):
             whole = builder.AddNamedSystem(f"whole_{port}", AffineSystem(D=spread, y0=offset))
@@ -172,20 +216,9 @@ class DifferentialIk(Diagram):
             builder.Connect(whole.get_output_port(), solver.GetInputPort(port))
         velocity = builder.AddNamedSystem("velocity", MatrixGain(spread.T))
         builder.Connect(solver.get_output_port(), velocity.get_input_port())
-        builder.Connect(velocity.get_output_port(), self._integrator.get_input_port())
+        builder.Connect(velocity.get_output_port(), integrator.GetInputPort("velocity"))
 
-        builder.ExportOutput(self._integrator.get_output_port(), "position")
+        builder.ExportOutput(integrator.get_output_port(), "position")
         builder.ExportOutput(velocity.get_output_port(), "velocity")
         builder.BuildInto(self)
         self.set_name("DifferentialIk")
-
-    def set_initial_position(self, root_context: Context, q: np.ndarray) -> None:
-        """Sets the joint angles (rad) from which the commands start, in the root's context."""
-        q = np.asarray(q, dtype=float)
-        if q.shape != (len(self._robot.indices),) or not np.isfinite(q).all():
-            raise IgaDrakeError(
-                f"DifferentialIk: initial position {q} has to be {len(self._robot.indices)} finite "
-                "angles in rad"
-            )
-        context = self._integrator.GetMyMutableContextFromRoot(root_context)
-        self._integrator.set_integral_value(context, q)

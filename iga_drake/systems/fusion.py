@@ -1,22 +1,54 @@
 """From the depth and label images of several cameras to clouds of target and grasped object."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
 from pydrake.perception import PointCloud
-from pydrake.systems.framework import LeafSystem, ValueProducer
+from pydrake.systems.framework import Context, LeafSystem, ValueProducer
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I
 from scipy.ndimage import binary_dilation
 
-from iga_drake.errors import IgaDrakeError
+from iga_drake.errors import IgaDrakeError, check_range
 from iga_drake.geometry.voxels import voxel_cloud
+from iga_drake.systems.ports import Role
 
 
 class FusionError(IgaDrakeError):
     """An image or a setting that the fusion can't work with."""
+
+
+@dataclass
+class FusionConfig:
+    """How depth images become clouds."""
+
+    # Edge length of a voxel (m).
+    voxel_size: float = 0.005
+    # Corners of the box in W outside of which points are dropped (m), lower < upper.
+    crop_lower: list[float] = field(default_factory=lambda: [0.1, -0.6, -0.02])
+    crop_upper: list[float] = field(default_factory=lambda: [0.95, 0.6, 0.8])
+    # Pixels nearer than this to a jump in depth or label are dropped (px).
+    erosion: int = 1
+    # A jump is a difference between neighbours above this (m).
+    depth_jump: float = 0.02
+    # Connected groups of fewer voxels than this are dropped, >= 1 (1: none is dropped).
+    min_cluster: int = 8
+    # An image older than this counts as none (s).
+    maximum_age: float = 0.5
+
+    def check(self, where: str = "fusion") -> None:
+        """Raises `ConfigError` for a value out of range."""
+        for name in ("voxel_size", "depth_jump", "min_cluster", "maximum_age"):
+            check_range(getattr(self, name) > 0, f"{where}.{name}", getattr(self, name), "> 0")
+        check_range(self.erosion >= 0, f"{where}.erosion", self.erosion, ">= 0")
+        lower, upper = self.crop_lower, self.crop_upper
+        ordered = len(lower) == len(upper) == 3 and all(
+            low < up for low, up in zip(lower, upper, strict=True)
+        )
+        check_range(ordered, f"{where}.crop_lower", lower, f"3 numbers below crop_upper = {upper}")
 
 
 @dataclass(frozen=True)
@@ -26,6 +58,8 @@ class CameraCounts:
     valid: int  # pixels with a depth
     target: int  # pixels used for the target's cloud, before the voxel filter
     grasped: int  # pixels used for the grasped object's cloud, before the voxel filter
+    # Why nothing of it was used, in words that follow the camera's name; empty if some was.
+    problem: str = ""
 
 
 @dataclass(frozen=True)
@@ -62,7 +96,8 @@ class PointCloudFusion(LeafSystem):
 
     Pixels without a depth (0, NaN, infinite), near jumps in depth or label, and points outside the
     crop box are dropped; the rest is unprojected into W, averaged by voxel, and specks are removed.
-    All outputs come from one cached calculation and are pure functions of the inputs.
+    An image that is too old is no image. All outputs come from one cached calculation and are pure
+    functions of the inputs and of the time.
 
     .. pydrake_system::
 
@@ -71,47 +106,29 @@ class PointCloudFusion(LeafSystem):
         - <camera>.depth_image
         - <camera>.label_image
         - <camera>.pose
+        - <camera>.time (optional)
         output_ports:
         - target_cloud
         - grasped_cloud
         - camera_counts
 
     - `<camera>.depth_image` (m), `<camera>.label_image` (roles), `<camera>.pose` (X_WC of the
-      optical frame): as in the port contract, for each camera.
+      optical frame), `<camera>.time` (s, when the images were taken): as in the port contract, for
+      each camera. Without a time, images are always new.
     - `target_cloud`, `grasped_cloud`: `PointCloud` with float32 xyz in W (m); empty if nothing is
       seen.
     - `camera_counts`: dict of camera name -> `CameraCounts`.
     """
 
-    def __init__(
-        self,
-        cameras: Mapping[str, CameraInfo],
-        *,
-        voxel_size: float = 0.005,
-        crop_lower: Sequence[float] = (-1.0, -1.0, -1.0),
-        crop_upper: Sequence[float] = (1.5, 1.0, 1.5),
-        erosion: int = 1,
-        depth_jump: float = 0.02,
-        min_cluster: int = 8,
-        target_label: int = 1,
-        grasped_label: int = 2,
-    ):
-        """See `iga_drake.station.scenario.Fusion`; the labels are the contract's `Role` values."""
+    def __init__(self, cameras: Mapping[str, CameraInfo], config: FusionConfig | None = None):
+        """`cameras`: name -> intrinsics. Raises `ConfigError`, and `FusionError` without cameras."""
         super().__init__()
         if not cameras:
             raise FusionError("PointCloudFusion: at least one camera is needed")
-        self._voxel_size = voxel_size
-        self._lower = np.asarray(crop_lower, dtype=np.float32)
-        self._upper = np.asarray(crop_upper, dtype=np.float32)
-        if not (voxel_size > 0 and (self._lower < self._upper).all()):
-            raise FusionError(
-                f"PointCloudFusion: voxel_size {voxel_size} m has to be > 0 and the crop box "
-                f"{crop_lower} below {crop_upper}"
-            )
-        self._erosion = erosion
-        self._depth_jump = depth_jump
-        self._min_cluster = min_cluster
-        self._target, self._grasped = target_label, grasped_label
+        self._config = config = config or FusionConfig()
+        config.check("FusionConfig")
+        self._lower = np.asarray(config.crop_lower, dtype=np.float32)
+        self._upper = np.asarray(config.crop_upper, dtype=np.float32)
         self._rays = {name: pixel_rays(info) for name, info in cameras.items()}
         self._inputs = {
             name: (
@@ -121,12 +138,13 @@ class PointCloudFusion(LeafSystem):
             )
             for name in cameras
         }
+        self._times = {name: self.DeclareVectorInputPort(f"{name}.time", 1) for name in cameras}
         self._fused = self.DeclareCacheEntry(
             description="fused clouds",
             value_producer=ValueProducer(
                 allocate=lambda: AbstractValue.Make(object()), calc=self._calc_fused
             ),
-            prerequisites_of_calc={self.all_input_ports_ticket()},
+            prerequisites_of_calc={self.all_input_ports_ticket(), self.time_ticket()},
         )
         for name in ("target", "grasped"):
             self.DeclareAbstractOutputPort(
@@ -137,9 +155,13 @@ class PointCloudFusion(LeafSystem):
         )
 
     def _calc_fused(self, context, value) -> None:
-        parts: dict[int, list[np.ndarray]] = {self._target: [], self._grasped: []}
+        parts: dict[int, list[np.ndarray]] = {Role.TARGET: [], Role.GRASPED: []}
         counts = {}
         for name, ports in self._inputs.items():
+            problem = self._find_problem(name, context)
+            if problem:
+                counts[name] = CameraCounts(0, 0, 0, problem)
+                continue
             depth, label, X_WC = (port.Eval(context) for port in ports)
             points, labels, valid = self._unproject(name, depth.data, label.data, X_WC)
             number = {}
@@ -147,12 +169,28 @@ class PointCloudFusion(LeafSystem):
                 mine = labels == role
                 clouds.append(points if mine.all() else points.compress(mine, axis=1))
                 number[role] = clouds[-1].shape[1]
-            counts[name] = CameraCounts(valid, number[self._target], number[self._grasped])
+            counts[name] = CameraCounts(valid, number[Role.TARGET], number[Role.GRASPED])
         target, grasped = (
-            voxel_cloud(np.hstack(parts[role]).T, self._voxel_size, self._min_cluster)
-            for role in (self._target, self._grasped)
+            voxel_cloud(np.hstack(parts[role] or [np.zeros((3, 0), np.float32)]).T, self._config.voxel_size, self._config.min_cluster)
+            for role in (Role.TARGET, Role.GRASPED)
         )
         value.set_value(FusedClouds(target, grasped, counts))
+
+    def _find_problem(self, name: str, context: Context) -> str:
+        """Why this camera's images can't be used; empty if they can."""
+        port = self._times[name]
+        if not port.HasValue(context):
+            return ""
+        taken = float(port.Eval(context)[0])
+        age = context.get_time() - taken
+        if not math.isfinite(taken):
+            return "has delivered no image yet: check the camera and its connection"
+        if age > self._config.maximum_age:
+            return (
+                f"delivered its last image {age:.1f} s ago, at most {self._config.maximum_age:g} s "
+                "are allowed: check the camera and its connection"
+            )
+        return ""
 
     def _unproject(
         self, name: str, depth: np.ndarray, label: np.ndarray, X_WC: RigidTransform
@@ -167,14 +205,14 @@ class PointCloudFusion(LeafSystem):
                     f"intrinsics say {rays[0].shape[1]} x {rays[0].shape[0]} px"
                 )
         valid = (depth > 0) & (depth < np.inf)
-        wanted = (label == self._target) | (label == self._grasped)
+        wanted = (label == Role.TARGET) | (label == Role.GRASPED)
         rows = np.flatnonzero(wanted.any(axis=1))
         columns = np.flatnonzero(wanted.any(axis=0))
         number = int(np.count_nonzero(valid))
         if len(rows) == 0:
             return np.zeros((3, 0), np.float32), np.zeros(0, np.int16), number
         # Only the part of the image that holds the objects, with a margin for the borders.
-        margin = self._erosion + 1
+        margin = self._config.erosion + 1
         part = tuple(
             slice(max(0, int(found[0]) - margin), int(found[-1]) + 1 + margin)
             for found in (rows, columns)
@@ -182,7 +220,7 @@ class PointCloudFusion(LeafSystem):
         depth, label, valid = depth[part], label[part], valid[part]
         z = np.where(valid, depth, np.float32(np.nan))
         good = wanted[part] & valid
-        good &= ~unreliable_pixels(z, label, jump=self._depth_jump, erosion=self._erosion)
+        good &= ~unreliable_pixels(z, label, jump=self._config.depth_jump, erosion=self._config.erosion)
         # Coordinate by coordinate: contiguous arrays, several times as fast as (P, 3) ones.
         z, label = z[good], label[good]
         x, y = (ray[part][good] * z for ray in rays)

@@ -1,9 +1,20 @@
 """Abstract values that travel between the systems of the diagram."""
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from pydrake.math import RigidTransform
+
+
+class Cause(StrEnum):
+    """Kinds of reasons why a task was not done."""
+
+    PERCEPTION = "perception"  # what the cameras delivered can't be used
+    ALIGNMENT = "alignment"  # no pose was found, or a wrong one
+    IK = "IK"  # the pose can't be reached, or the commanded motion breaks a limit
+    CONTACT = "contact"  # something was touched, dropped or left in a wrong place
+    TIME = "time"  # a time limit is over
 
 
 @dataclass(frozen=True)
@@ -54,3 +65,5 @@ class SupervisorStatus:
 
     holding: bool = False
     reason: str = ""
+    # Kind of the reason; None while commands pass.
+    cause: Cause | None = None

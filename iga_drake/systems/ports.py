@@ -9,7 +9,6 @@ from enum import IntEnum
 from typing import Literal
 
 PANDA_JOINTS = 7
-HAND_OPENING_MAX = 0.08  # m, both fingers together
 
 
 class Role(IntEnum):
@@ -48,6 +47,8 @@ def camera_ports(camera: str) -> tuple[Port, ...]:
         Port(f"{camera}.depth_image", "output", "ImageDepth32F", "m"),
         Port(f"{camera}.label_image", "output", "ImageLabel16I", "Role"),
         Port(f"{camera}.pose", "output", "RigidTransform", "m"),
+        # When the three images were taken, on the diagram's clock; NaN before there is any.
+        Port(f"{camera}.time", "output", "vector(1)", "s"),
     )
 
 

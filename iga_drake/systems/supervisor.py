@@ -6,27 +6,42 @@ import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
-from iga_drake.errors import IgaDrakeError
+from iga_drake.errors import check_range
 from iga_drake.planning.planning_robot import PlanningRobot
-from iga_drake.systems.messages import SupervisorStatus
+from iga_drake.systems.messages import Cause, SupervisorStatus
 
 
-@dataclass(frozen=True)
+@dataclass
 class SupervisorConfig:
     """What is allowed. Limits of the joints themselves come from the robot."""
 
-    # Period of the checks (s); a command is at most this late.
-    time_step: float = 0.005
     # Share of the joints' velocity limits allowed, in the commands and as measured.
     velocity_scale: float = 1.0
     # Largest difference (rad) between command and measurement.
     tracking_error: float = 0.2
     # The box (m, in W) that E has to stay in.
-    workspace_lower: tuple[float, float, float] = (-0.2, -0.75, -0.01)
-    workspace_upper: tuple[float, float, float] = (0.85, 0.75, 1.0)
+    workspace_lower: list[float] = field(default_factory=lambda: [-0.2, -0.75, -0.01])
+    workspace_upper: list[float] = field(default_factory=lambda: [0.85, 0.75, 1.0])
     # Largest external torque at each joint (N m), and the time (s) it may be exceeded.
-    torque_limit: tuple[float, ...] = (40.0, 40.0, 40.0, 40.0, 10.0, 10.0, 10.0)
+    torque_limit: list[float] = field(
+        default_factory=lambda: [40.0, 40.0, 40.0, 40.0, 10.0, 10.0, 10.0]
+    )
     torque_time: float = 0.05
+
+    def check(self, joints: int, where: str = "supervisor") -> None:
+        """Raises `ConfigError` for a value out of range; the robot has this many joints."""
+        scale = self.velocity_scale
+        check_range(0 < scale <= 1, f"{where}.velocity_scale", scale, "above 0, at most 1")
+        for name in ("tracking_error", "torque_time"):
+            check_range(getattr(self, name) > 0, f"{where}.{name}", getattr(self, name), "> 0")
+        lower, upper = self.workspace_lower, self.workspace_upper
+        ordered = len(lower) == len(upper) == 3 and all(
+            low < up for low, up in zip(lower, upper, strict=True)
+        )
+        check_range(ordered, f"{where}.workspace_lower", lower, f"3 numbers below {upper}")
+        torque = self.torque_limit
+        fits = len(torque) == joints and min(torque) > 0
+        check_range(fits, f"{where}.torque_limit", torque, f"{joints} numbers > 0, one a joint")
 
 
 @dataclass(frozen=True)
@@ -68,23 +83,23 @@ class Supervisor(LeafSystem):
     position of E against a box; external torque. Holding is latched: it ends with a new context.
     """
 
-    def __init__(self, robot: PlanningRobot, config: SupervisorConfig | None = None) -> None:
+    def __init__(
+        self, robot: PlanningRobot, config: SupervisorConfig | None = None, *, period: float
+    ) -> None:
+        """`period` (s) of the checks: a command is at most this late. Raises `ConfigError`."""
         super().__init__()
         self.set_name("Supervisor")
         self._config = config = config or SupervisorConfig()
+        self._period = period
         count = len(robot.indices)
-        if len(config.torque_limit) != count:
-            raise IgaDrakeError(
-                f"SupervisorConfig.torque_limit holds {len(config.torque_limit)} values, the robot "
-                f"has {count} joints"
-            )
+        config.check(count, "SupervisorConfig")
         self._robot, self._limits = robot, robot.limits
         self._commanded_input = self.DeclareVectorInputPort("position_commanded", count)
         self._position_input = self.DeclareVectorInputPort("position_measured", count)
         self._velocity_input = self.DeclareVectorInputPort("velocity_measured", count)
         self._torque_input = self.DeclareVectorInputPort("torque_external", count)
         self._memory = self.DeclareAbstractState(Value[object](_Memory()))
-        self.DeclarePeriodicUnrestrictedUpdateEvent(config.time_step, 0.0, self._update)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
         ticket = {self.abstract_state_ticket(self._memory)}
         self.DeclareVectorOutputPort(
             "position",
@@ -113,7 +128,7 @@ class Supervisor(LeafSystem):
             overloaded = memory.time_overloaded
             overloaded = context.get_time() if overloaded is None else overloaded
         last = self._first_position(context) if memory.position is None else memory.position
-        reason = self._find_reason(
+        cause, reason = self._find_reason(
             command=command,
             last=last,
             position=self._position_input.Eval(context),
@@ -122,7 +137,7 @@ class Supervisor(LeafSystem):
             overload_time=0.0 if overloaded is None else context.get_time() - overloaded,
         )
         if reason:
-            memory = replace(memory, position=last, status=SupervisorStatus(True, reason))
+            memory = replace(memory, position=last, status=SupervisorStatus(True, reason, cause))
         else:
             memory = replace(memory, position=command, time_overloaded=overloaded)
         state.get_mutable_abstract_state(int(self._memory)).set_value(memory)
@@ -137,8 +152,9 @@ class Supervisor(LeafSystem):
         velocity: np.ndarray,
         torque: np.ndarray,
         overload_time: float,
-    ) -> str:
-        """Why the arm has to be held; empty if nothing is wrong."""
+    ) -> tuple[Cause, str]:
+        """Why the arm has to be held: lag and torque come from touching something, all else from
+        the commanded motion. The reason is empty if nothing is wrong."""
         config, limits = self._config, self._limits
         for name, value in (
             ("position_commanded", command),
@@ -147,18 +163,18 @@ class Supervisor(LeafSystem):
             ("torque_external", torque),
         ):
             if not np.isfinite(value).all():
-                return f"{name} isn't finite: {value}"
+                return Cause.IK, f"{name} isn't finite: {value}"
         lower, upper = limits.position_lower(), limits.position_upper()
         if (reason := _outside("commanded position", "rad", command, lower, upper)) or (
             reason := _outside(
                 "commanded velocity",
                 "rad/s",
-                (command - last) / config.time_step,
+                (command - last) / self._period,
                 config.velocity_scale * limits.velocity_lower() * (1 + 1e-6),
                 config.velocity_scale * limits.velocity_upper() * (1 + 1e-6),
             )
         ):
-            return reason
+            return Cause.IK, reason
         if reason := _outside(
             "measured velocity",
             "rad/s",
@@ -166,26 +182,26 @@ class Supervisor(LeafSystem):
             config.velocity_scale * limits.velocity_lower(),
             config.velocity_scale * limits.velocity_upper(),
         ):
-            return reason
+            return Cause.IK, reason
         bound = np.full(len(command), config.tracking_error)
         if reason := _outside("tracking error", "rad", command - position, -bound, bound):
-            return reason
+            return Cause.CONTACT, reason
         p_WE = self._robot.pose(command).translation()
         for axis, value, low, high in zip(
             "xyz", p_WE, config.workspace_lower, config.workspace_upper, strict=True
         ):
             if not low <= value <= high:
-                return (
+                return Cause.IK, (
                     f"commanded end effector leaves the workspace: {axis} = {value:.3f} m is "
                     f"outside [{low:.3f}, {high:.3f}]"
                 )
         if overload_time >= config.torque_time:
             joint = int(np.argmax(np.abs(torque) / config.torque_limit))
-            return (
+            return Cause.CONTACT, (
                 f"external torque of {torque[joint]:.1f} N m at joint {joint + 1} is above "
                 f"{config.torque_limit[joint]:.1f} N m for {overload_time:.2f} s"
             )
-        return ""
+        return Cause.IK, ""
 
     def _calc_position(self, context: Context, output: BasicVector) -> None:
         position = context.get_abstract_state(int(self._memory)).get_value().position

@@ -8,35 +8,36 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
-from iga_drake.errors import IgaDrakeError
+from iga_drake.errors import IgaDrakeError, check_range
 from iga_drake.planning.inverse_kinematics import PoseSolver
 from iga_drake.planning.routes import LinePath, Path, plan_path, pose_error
-from iga_drake.systems.messages import EndEffectorTarget, FollowerStatus
+from iga_drake.systems.messages import NO_TARGET, EndEffectorTarget, FollowerStatus
+from iga_drake.systems.ports import PANDA_JOINTS
 
 # Distance (m) or angle (rad) between desired and measured pose from which on the arm counts as not
 # having got there.
 _LEFT_BEHIND = 0.05
 
 
-@dataclass(frozen=True)
+@dataclass
 class WaypointFollowerConfig:
-    """Speeds, ramps and tolerances."""
+    """How the arm follows waypoints: rate, speeds, ramps and tolerances."""
 
-    # Period of the updates (s).
-    time_step: float = 0.005
+    # Time between two commands to the arm (s).
+    period: float = 0.01
     # Speeds of E on the way (m/s, rad/s), before a target's `speed_scale`.
-    linear_speed: float = 0.25
-    angular_speed: float = math.radians(90)
+    linear_speed: float = 0.2
+    angular_speed: float = 0.8
     # Time (s) to rise from rest to that speed and to come to rest again.
     ramp: float = 0.2
     # The measured pose counts as reached within these (m, rad).
     position_tolerance: float = 0.003
     rotation_tolerance: float = math.radians(1.5)
 
-    def __post_init__(self) -> None:
+    def check(self, where: str = "control") -> None:
+        """Raises `ConfigError` for a value out of range."""
         for name, value in vars(self).items():
-            if not (math.isfinite(value) and value > 0):
-                raise IgaDrakeError(f"WaypointFollowerConfig.{name} is {value}: it has to be > 0")
+            check_range(math.isfinite(value) and value > 0, f"{where}.{name}", value, "> 0")
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ class _Motion:
     progress: float = 0.0  # 0 at the start, 1 at the target
     progress_rate: float = 0.0  # 1/s
     opening: float | None = None  # m
+    home: np.ndarray | None = None  # rad, measured at the first update
     time_reached: float | None = None  # s
     force_start: np.ndarray | None = None  # N, where the target has a contact force
     touched: bool = False
@@ -70,7 +72,7 @@ class WaypointFollower(LeafSystem):
         input_ports:
         - target
         - pose_measured
-        - position_measured (optional)
+        - position_measured
         - force_measured (optional)
         output_ports:
         - desired_pose
@@ -82,16 +84,16 @@ class WaypointFollower(LeafSystem):
       motion from the last commanded pose, or from the measured one if the arm didn't get there;
       linear and angular speed stay within their limits and both motions end together.
     - `pose_measured` (RigidTransform): X_WE.
-    - `position_measured` (N, rad): the arm's joints. If it is connected and a `solver` was given,
-      a straight line that the arm can't follow is replaced by a path through the joints.
+    - `position_measured` (7, rad): the arm's joints. If a `solver` was given, a straight line that
+      the arm can't follow is replaced by a path through the joints.
     - `force_measured` (3, N in W): external force on the hand. Targets with a `contact_force` need
       it: once it has changed by that much since the motion began, the desired pose stays at the
       measured one and the target counts as reached.
     - `desired_pose` (RigidTransform): X_WE now. Before the first target, the pose first measured.
     - `hand.opening` (1, m): `opening_moving` on the way, `opening_reached` after it. Before the
-      first target, `initial_opening`.
-    - `nominal_posture` (N, rad): the last posture that a target or a path asked for, at first
-      `home`.
+      first target, the `opening_moving` of the target of sequence 0.
+    - `nominal_posture` (7, rad): the last posture that a target or a path asked for, at first the
+      joints as first measured.
     - `status` (FollowerStatus): the last target reached and settled, and the errors of the measured
       pose against the present target. A target out of reach is never reported; whoever sent it has
       to stop waiting.
@@ -102,23 +104,20 @@ class WaypointFollower(LeafSystem):
     def __init__(
         self,
         *,
-        home: np.ndarray,
-        initial_opening: float = 0.08,
         solver: PoseSolver | None = None,
         config: WaypointFollowerConfig | None = None,
     ) -> None:
         super().__init__()
         self.set_name("WaypointFollower")
         self._config = config or WaypointFollowerConfig()
-        self._home = np.array(home, dtype=float)
-        self._initial_opening = initial_opening
-        self._target_input = self.DeclareAbstractInputPort("target", Value[object]())
+        self._config.check("WaypointFollowerConfig")
+        self._target_input = self.DeclareAbstractInputPort("target", Value[object](NO_TARGET))
         self._pose_input = self.DeclareAbstractInputPort("pose_measured", Value(RigidTransform()))
-        self._position_input = self.DeclareVectorInputPort("position_measured", len(self._home))
+        self._position_input = self.DeclareVectorInputPort("position_measured", PANDA_JOINTS)
         self._force_input = self.DeclareVectorInputPort("force_measured", 3)
         self._solver = solver
         self._motion = self.DeclareAbstractState(Value[object](_Motion()))
-        self.DeclarePeriodicUnrestrictedUpdateEvent(self._config.time_step, 0.0, self._update)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(self._config.period, 0.0, self._update)
 
         ticket = {self.abstract_state_ticket(self._motion)}
         self.DeclareAbstractOutputPort(
@@ -127,8 +126,15 @@ class WaypointFollower(LeafSystem):
             self._calc_pose,
             ticket | {self._pose_input.ticket()},
         )
-        self.DeclareVectorOutputPort("hand.opening", 1, self._calc_opening, ticket)
-        self.DeclareVectorOutputPort("nominal_posture", len(self._home), self._calc_posture, ticket)
+        self.DeclareVectorOutputPort(
+            "hand.opening", 1, self._calc_opening, ticket | {self._target_input.ticket()}
+        )
+        self.DeclareVectorOutputPort(
+            "nominal_posture",
+            PANDA_JOINTS,
+            self._calc_posture,
+            ticket | {self._position_input.ticket()},
+        )
         self.DeclareAbstractOutputPort(
             "status", lambda: Value[object](FollowerStatus()), self._calc_status, ticket
         )
@@ -136,6 +142,8 @@ class WaypointFollower(LeafSystem):
     def _update(self, context: Context, state: State) -> EventStatus:
         motion: _Motion = context.get_abstract_state(int(self._motion)).get_value()
         X_WE = RigidTransform(self._pose_input.Eval(context))  # a copy: Eval refers to the cache
+        if motion.home is None:
+            motion = replace(motion, home=self._position_input.Eval(context).copy())
         target = self._target_input.Eval(context)
         desired = motion.X_WDesired or X_WE
         if target.sequence > 0 and (
@@ -163,7 +171,7 @@ class WaypointFollower(LeafSystem):
         if max(pose_error(X_WStart, X_WE)) > _LEFT_BEHIND:
             X_WStart = X_WE
         path: Path = LinePath(X_WStart, target.X_WE, target.nominal_posture)
-        if self._solver is not None and self._position_input.HasValue(context):
+        if self._solver is not None:
             path = plan_path(
                 self._solver,
                 q=self._position_input.Eval(context).copy(),
@@ -217,11 +225,11 @@ class WaypointFollower(LeafSystem):
             )
         posture = target.nominal_posture
         if posture is not None and (
-            np.shape(posture) != self._home.shape or not np.isfinite(posture).all()
+            np.shape(posture) != (PANDA_JOINTS,) or not np.isfinite(posture).all()
         ):
             raise IgaDrakeError(
                 f"target {target.sequence}: nominal_posture {posture} has to be "
-                f"{len(self._home)} finite angles in rad"
+                f"{PANDA_JOINTS} finite angles in rad"
             )
         return target
 
@@ -239,9 +247,9 @@ class WaypointFollower(LeafSystem):
             cruise = 1.0 / duration
             acceleration = cruise / config.ramp
             braking = math.sqrt(2.0 * acceleration * (1.0 - progress))
-            rate = min(rate + acceleration * config.time_step, cruise, braking)
-            progress += rate * config.time_step
-            if 1.0 - progress < 1e-6 or rate * config.time_step < 1e-9:
+            rate = min(rate + acceleration * config.period, cruise, braking)
+            progress += rate * config.period
+            if 1.0 - progress < 1e-6 or rate * config.period < 1e-9:
                 progress, rate = 1.0, 0.0
             progress = min(progress, 1.0)
         else:
@@ -283,11 +291,14 @@ class WaypointFollower(LeafSystem):
 
     def _calc_opening(self, context: Context, output: BasicVector) -> None:
         opening = context.get_abstract_state(int(self._motion)).get_value().opening
-        output.SetFromVector([self._initial_opening if opening is None else opening])
+        if opening is None:
+            opening = self._target_input.Eval(context).opening_moving
+        output.SetFromVector([opening])
 
     def _calc_posture(self, context: Context, output: BasicVector) -> None:
-        posture = context.get_abstract_state(int(self._motion)).get_value().posture
-        output.SetFromVector(self._home if posture is None else posture)
+        motion = context.get_abstract_state(int(self._motion)).get_value()
+        posture = motion.home if motion.posture is None else motion.posture
+        output.SetFromVector(self._position_input.Eval(context) if posture is None else posture)
 
     def _calc_status(self, context: Context, output: AbstractValue) -> None:
         output.set_value(context.get_abstract_state(int(self._motion)).get_value().status)

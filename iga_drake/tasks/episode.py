@@ -1,42 +1,95 @@
-"""One seeded episode of a task, from building its diagram to the verdict."""
+"""One seeded episode of a task: built, stepped, judged."""
 
 import time as wall
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
 
-from iga_drake.aligners.protocol import Aligner, AlignerError, PoseEstimate
-from iga_drake.aligners.registry import make_aligner
-from iga_drake.demonstrations.alignment import Alignment
+from iga_drake.aligners.protocol import Aligner, PoseEstimate
+from iga_drake.aligners.registry import EXPERT, check_aligner
 from iga_drake.demonstrations.demonstration import (
     Demonstration,
     DemonstrationSet,
-    read_demonstrations,
+    Observation,
+    Provenance,
+    Trajectory,
+    Waypoint,
 )
+from iga_drake.demonstrations.store import read_demonstrations
 from iga_drake.paths import models_dir
-from iga_drake.policy.motion import Phase, PhaseEntry
+from iga_drake.policy.inference import (
+    Inference,
+    InferenceAnswer,
+    LocalInference,
+    WorkerInference,
+)
+from iga_drake.policy.machine import PolicyMemory
+from iga_drake.policy.motion import Phase, PhaseEntry, PolicyStatus, WaypointMotion
+from iga_drake.station.make import make_station
+from iga_drake.station.panda.model import find_panda
 from iga_drake.station.scenario import Scenario
-from iga_drake.tasks.pose_error import ROUND_FAMILIES, equivalent_poses, least_pose_error
+from iga_drake.systems.messages import Cause
+from iga_drake.tasks.pose_error import pose_error_at
 from iga_drake.tasks.registry import make_task
-from iga_drake.tasks.robot_diagram import EpisodeDiagram, build_episode_diagram
-from iga_drake.tasks.task import Snapshot, Split, Task, TaskError
+from iga_drake.tasks.robot_diagram import RobotDiagram, build_robot_diagram
+from iga_drake.tasks.snapshots import Snapshot, TaskError, read_snapshot
+from iga_drake.tasks.task import Split, Task
+from iga_drake.version import code_version
 
-EXPERT = "expert"
-# How many of the demonstrations make up the context.
-CONTEXT_SIZE = 3
 # Keeps the cameras' seeds of test episodes apart from those of demonstrations.
 TEST_SEED_OFFSET = 1_000_000
 # Time between two snapshots of the true state (s).
 SNAPSHOT_PERIOD = 0.05
+# Every so many snapshots become a sample of a demonstration's trajectory.
+TRAJECTORY_STRIDE = 2
 # Time for which the world goes on once the policy is done, or has given up (s).
 AFTER_DONE, AFTER_HOLD = 3.0, 0.5
 # A predicted pose further than this from the expert's is a failed alignment (m, rad).
 ALIGNED_POSITION, ALIGNED_ROTATION = 0.03, np.radians(25.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaypointResult:
+    """What became of one waypoint that was inferred."""
+
+    name: str
+    estimate: PoseEstimate
+    # X_WE and energy that the policy settled on; the best of the estimate if it refused.
+    X_WE_predicted: RigidTransform
+    energy: float
+    # The expert's X_WE at the moment of the inference, and the distance of the prediction from it
+    # up to the symmetries of hand and objects (m, rad).
+    X_WE_expert: RigidTransform
+    position_error: float
+    rotation_error: float
+    # Wall-clock time of the inference (s).
+    inference_seconds: float
+    # Measured X_WE where it was reached, before the hand acted there.
+    X_WE_reached: RigidTransform | None = None
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the prediction is near the expert's pose."""
+        return self.position_error <= ALIGNED_POSITION and self.rotation_error <= ALIGNED_ROTATION
+
+    def row(self) -> dict[str, Any]:
+        """The result as plain JSON values."""
+        return {
+            "name": self.name,
+            "energy": self.energy,
+            "familiarity": self.estimate.familiarity,
+            "position_error": self.position_error,
+            "rotation_error": self.rotation_error,
+            "inference_seconds": self.inference_seconds,
+            "reached": self.X_WE_reached is not None,
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,27 +100,19 @@ class EpisodeResult:
     aligner: str
     seed: int
     split: Split
+    # `Scenario.digest`.
+    scenario: str
     success: bool
-    # "perception", "alignment", "IK", "contact" or "time" when failed; else empty.
-    cause: str = ""
+    # Kind of the reason when failed.
+    cause: Cause | None = None
     reason: str = ""
     timeline: tuple[PhaseEntry, ...] = ()
-    # What the success predicate measured (SI).
-    measures: dict[str, float] = field(default_factory=dict)
-    estimate: PoseEstimate | None = None
-    energy: float | None = None
-    # X_WE that the policy settled on, and the expert's at the same moment.
-    X_WE_predicted: RigidTransform | None = None
-    X_WE_expert: RigidTransform | None = None
-    # Between the two, up to the task's symmetries (m, rad).
-    position_error: float | None = None
-    rotation_error: float | None = None
-    # Measured X_WE at the waypoints.
-    waypoints_reached: tuple[RigidTransform, ...] = ()
-    target_points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # in W
-    grasped_points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # in E
-    opening_reached: float = 0.0  # m
-    inference_seconds: float | None = None
+    # What the success predicates measured (SI).
+    measures: Mapping[str, float] = field(default_factory=dict)
+    # One for each waypoint that was inferred.
+    waypoints: tuple[WaypointResult, ...] = ()
+    # What was observed, by the names that the task gives its clouds.
+    observations: Mapping[str, Observation] = field(default_factory=dict)
     build_seconds: float = 0.0
     wall_seconds: float = 0.0
     simulated_seconds: float = 0.0
@@ -77,52 +122,89 @@ class EpisodeResult:
         """Simulated time over wall-clock time, cameras and inference included."""
         return self.simulated_seconds / self.wall_seconds if self.wall_seconds > 0 else 0.0
 
+    @property
+    def worst(self) -> WaypointResult | None:
+        """The waypoint whose prediction is furthest from the expert's; None if there is none."""
+        if not self.waypoints:
+            return None
+        return max(self.waypoints, key=lambda w: w.position_error + 0.1 * w.rotation_error)
+
     def row(self) -> dict[str, Any]:
-        """The result as plain JSON values, without clouds."""
+        """The result as plain JSON values, without clouds; the errors are those of the worst
+        waypoint, the inference time is that of all."""
+        worst = self.worst
         return {
             "task": self.task,
             "aligner": self.aligner,
             "seed": self.seed,
             "split": self.split,
+            "scenario_digest": self.scenario,
+            "code_version": code_version(),
             "success": self.success,
-            "cause": self.cause,
+            "cause": "" if self.cause is None else self.cause.value,
             "reason": self.reason,
-            "energy": self.energy,
-            "position_error": self.position_error,
-            "rotation_error": self.rotation_error,
-            "inference_seconds": self.inference_seconds,
+            "position_error": None if worst is None else worst.position_error,
+            "rotation_error": None if worst is None else worst.rotation_error,
+            "inference_seconds": (
+                sum(w.inference_seconds for w in self.waypoints) if self.waypoints else None
+            ),
             "real_time_factor": self.real_time_factor,
             "simulated_seconds": self.simulated_seconds,
             "wall_seconds": self.wall_seconds,
             "build_seconds": self.build_seconds,
-            "measures": dict(self.measures),
+            "measures": {name: float(value) for name, value in self.measures.items()},
+            "waypoints": [waypoint.row() for waypoint in self.waypoints],
             "timeline": [
-                {"time": entry.time, "phase": entry.phase.value, "detail": entry.detail}
+                {
+                    "time": entry.time,
+                    "phase": entry.phase.value,
+                    "subject": entry.subject,
+                    "detail": entry.detail,
+                }
                 for entry in self.timeline
             ],
         }
 
+    def __str__(self) -> str:
+        parts = [
+            f"{w.name}: energy {w.energy:.3f}, pose error {100 * w.position_error:.1f} cm "
+            f"{np.degrees(w.rotation_error):.0f} deg"
+            for w in self.waypoints
+        ]
+        parts.append(
+            f"{self.simulated_seconds:.1f} s simulated in {self.wall_seconds:.1f} s "
+            f"(real-time factor {self.real_time_factor:.2f})"
+        )
+        cause = "" if self.cause is None else self.cause.value
+        verdict = "SUCCESS" if self.success else f"FAILURE ({cause}): {self.reason}"
+        return "\n  ".join([verdict, *parts])
 
-class ExpertAligner:
-    """Stands in for an aligner and answers with the expert's pose: it sees the true state."""
+
+class ExpertInference:
+    """Answers with the expert's pose, which it knows from the true state."""
 
     name = EXPERT
 
-    def __init__(self) -> None:
-        self.pose: Callable[[], RigidTransform] | None = None
+    def __init__(self, poses: Callable[[], tuple[RigidTransform, ...]]) -> None:
+        """`poses`: gives the expert's X_WE now, one a waypoint."""
+        self._poses = poses
+        self._waypoint = 0
 
-    def align(
-        self,
-        context: tuple[Alignment, ...],
-        grasped: np.ndarray,
-        target: np.ndarray,
-        *,
-        seed: int = 0,
-    ) -> PoseEstimate:
+    def start(self, waypoint: int, grasped: np.ndarray, target: np.ndarray, seed: int) -> int:
+        """See `Inference.start`."""
+        self._waypoint = waypoint
+        return 0
+
+    def poll(self, question: int, timeout: float) -> InferenceAnswer:
         """The expert's pose with energy 0, whatever the clouds are."""
-        if self.pose is None:
-            raise TaskError("ExpertAligner.pose: None found, set it before the episode")
-        return PoseEstimate(self.pose().GetAsMatrix4()[None], np.zeros(1), np.ones(1))
+        X_WE = self._poses()[self._waypoint].GetAsMatrix4()
+        return InferenceAnswer(PoseEstimate(X_WE[None], np.zeros(1), np.ones(1)), 0.0)
+
+    def cancel(self) -> None:
+        """Nothing is ever under way."""
+
+    def close(self) -> None:
+        """Nothing runs."""
 
 
 def demonstrations_path(scenario: Scenario) -> Path:
@@ -131,203 +213,331 @@ def demonstrations_path(scenario: Scenario) -> Path:
     return path if path.is_absolute() else models_dir() / path
 
 
-def run_episode(
-    scenario: Scenario,
-    *,
-    seed: int,
-    aligner: str | Aligner | None = None,
-    split: Split = "test",
-    meshcat: Meshcat | None = None,
-    on_event: Callable[[str], None] = print,
-) -> EpisodeResult:
-    """Runs one episode.
+class Episode:
+    """A task on one seeded scene, in simulation: step it, run it to its end, judge it.
+
+    Use it as a context manager, or call `close`: an aligner given by name runs in a process of its
+    own, which is ended then (at the latest when Python ends).
 
     Args:
       scenario: how the diagram is wired.
       seed: decides scene, camera noise and the aligner's random choices.
-      aligner: an aligner or the name of one, or "expert"; default: the scenario's.
+      aligner: the name of an aligner, which runs in a worker process, or an aligner, which runs in
+        this one, or "expert"; default: the scenario's.
       split: whose objects: "test" (never demonstrated) or "demonstration".
+      demonstrations: the aligner's context; default: the scenario's folder.
       meshcat: where to show it.
-      on_event: called with one line of text for each phase and with the verdict.
 
     Raises:
       IgaDrakeError: bad input. An episode that fails is a result, not an error.
     """
-    began = wall.perf_counter()
-    task = make_task(scenario.task.name)
-    chosen = _choose_aligner(scenario, aligner)
-    demonstrations = None
-    if chosen.name != EXPERT:
-        demonstrations = read_demonstrations(demonstrations_path(scenario), task=task.name)
-        demonstrations = demonstrations.first(min(CONTEXT_SIZE, len(demonstrations)))
-    episode = build_episode_diagram(
-        scenario,
-        task=task,
-        scene=task.scene(seed + scenario.seeds.scene, split),
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        *,
+        seed: int = 0,
+        aligner: str | Aligner | None = None,
+        split: Split = "test",
+        demonstrations: DemonstrationSet | None = None,
+        meshcat: Meshcat | None = None,
+    ) -> None:
+        began = wall.perf_counter()
+        self.scenario, self.seed, self.split = scenario, seed, split
+        self.task: Task = make_task(scenario.task.name)
+        chosen = scenario.aligner.name if aligner is None else aligner
+        if chosen != EXPERT and demonstrations is None:
+            folder = demonstrations_path(scenario)
+            read = read_demonstrations(folder, task=self.task.name)
+            demonstrations = read.first(min(scenario.context_size, len(read)))
+        self.demonstrations = None if chosen == EXPERT else demonstrations
+        self.scene = self.task.scene(seed + scenario.seeds.scene, split)
         # Other draws of calibration and noise than any demonstration's with the same seed.
-        seed=seed + (TEST_SEED_OFFSET if split == "test" else 0),
-        aligner=chosen,
-        demonstrations=demonstrations,
-        meshcat=meshcat,
-    )
-    if isinstance(chosen, ExpertAligner):
-        chosen.pose = lambda: _expert_pose(task, episode, episode.snapshot())
-    on_event(f"{task.name}, seed {seed}, aligner {chosen.name}, {split} objects")
-    return _run(
-        EpisodeResult(task=task.name, aligner=chosen.name, seed=seed, split=split, success=False),
-        task,
-        episode,
-        time_limit=scenario.task.time_limit,
-        build_seconds=wall.perf_counter() - began,
-        on_event=on_event,
-    )
+        draws = seed + (TEST_SEED_OFFSET if split == "test" else 0)
+        self.inference = self._make_inference(chosen)
+        try:
+            self.robot: RobotDiagram = build_robot_diagram(
+                scenario,
+                make_station(scenario, scene=self.scene, seed=draws, meshcat=meshcat),
+                motion=self.task.motion,
+                inference=self.inference,
+                demonstrations=self.demonstrations,
+                seed=draws,
+            )
+        except BaseException:
+            self.inference.close()
+            raise
+        self._plant = self.robot.station.GetSubsystemByName("plant")
+        self._panda = find_panda(self._plant)
+        self.simulator = Simulator(self.robot.diagram)
+        self._build_seconds = wall.perf_counter() - began
+        self._begin()
 
+    def _make_inference(self, aligner: str | Aligner) -> Inference:
+        if aligner == EXPERT:
+            return ExpertInference(lambda: self._expert(self.snapshot()))
+        assert self.demonstrations is not None
+        contexts = self.demonstrations.contexts
+        if not isinstance(aligner, str):
+            beside = self.scenario.policy.inference == "concurrent"
+            return LocalInference(aligner, contexts, beside=beside)
+        check_aligner(aligner)
+        own = aligner == self.scenario.aligner.name
+        return WorkerInference(aligner, self.scenario.aligner.options if own else {}, contexts)
 
-def _choose_aligner(scenario: Scenario, aligner: str | Aligner | None) -> Aligner:
-    name = scenario.aligner.name if aligner is None else aligner
-    if not isinstance(name, str):
-        return name
-    if name == EXPERT:
-        return ExpertAligner()
-    options = scenario.aligner.options if name == scenario.aligner.name else {}
-    try:
-        return make_aligner(name, **options)
-    except TypeError as error:
-        raise AlignerError(
-            f"aligner.options {options}: '{name}' does not take them: {error}"
-        ) from error
+    def _begin(self) -> None:
+        self.simulator.Initialize()
+        self._snapshots = [self.snapshot()]
+        self._experts: list[tuple[RigidTransform, Snapshot]] = []
+        self._wall_seconds = 0.0
 
+    def restart(self) -> None:
+        """Begins again at time 0 with the same scene and draws: the same episode once more."""
+        self.inference.cancel()
+        self.simulator.reset_context(self.robot.diagram.CreateDefaultContext())
+        self._begin()
 
-def _expert_pose(task: Task, episode: EpisodeDiagram, snapshot: Snapshot) -> RigidTransform:
-    return task.expert(episode.scene, snapshot.X_WO, snapshot.X_WE)[0]
+    def close(self) -> None:
+        """Ends the aligner's process."""
+        self.inference.close()
 
+    def __enter__(self) -> "Episode":
+        return self
 
-def _run(
-    result: EpisodeResult,
-    task: Task,
-    episode: EpisodeDiagram,
-    *,
-    time_limit: float,
-    build_seconds: float,
-    on_event: Callable[[str], None],
-) -> EpisodeResult:
-    began = wall.perf_counter()
-    snapshots = [episode.snapshot()]
-    shown = 0
-    end: float | None = None
-    expert: RigidTransform | None = None
-    at_inference: Snapshot | None = None
-    while True:
-        now = snapshots[-1].time
-        if end is not None and now >= end:
-            break
-        episode.simulator.AdvanceTo(now + SNAPSHOT_PERIOD)
-        snapshots.append(episode.snapshot())
-        memory = episode.policy_memory()
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    # The state now
+
+    def snapshot(self) -> Snapshot:
+        """The true state now; nothing of it reaches the policy."""
+        context = self._plant.GetMyContextFromRoot(self.simulator.get_context())
+        return read_snapshot(self._plant, context, self._panda)
+
+    @property
+    def snapshots(self) -> tuple[Snapshot, ...]:
+        """The true states so far, one every `SNAPSHOT_PERIOD`."""
+        return tuple(self._snapshots)
+
+    @property
+    def memory(self) -> PolicyMemory:
+        """What the policy remembers now."""
+        policy = self.robot.policy
+        return policy.memory(policy.GetMyContextFromRoot(self.simulator.get_context()))
+
+    @property
+    def status(self) -> PolicyStatus:
+        """What the policy reports now."""
+        return self.memory.status
+
+    @property
+    def time(self) -> float:
+        """Simulated time (s)."""
+        return self.simulator.get_context().get_time()
+
+    @property
+    def over(self) -> bool:
+        """Whether the policy is done or has given up and the world came to rest after it, or the
+        task's time limit is over."""
+        status = self.status
+        if not status.phase.final:
+            return self.time >= self.scenario.task.time_limit - 1e-9
+        rest = AFTER_DONE if status.phase is Phase.DONE else AFTER_HOLD
+        return self.time >= status.timeline[-1].time + rest - 1e-9
+
+    # What happens
+
+    def step(self, duration: float = SNAPSHOT_PERIOD) -> PolicyStatus:
+        """Goes on for `duration` (s, simulated) and returns what the policy reports then."""
+        began = wall.perf_counter()
+        end = self.time + duration
+        while self.time < end - 1e-9:
+            due = self._snapshots[-1].time + SNAPSHOT_PERIOD
+            self.simulator.AdvanceTo(min(due, end))
+            if self.time >= due - 1e-9:
+                self._snapshots.append(self.snapshot())
+            if len(self.memory.estimates) > len(self._experts):
+                now = self.snapshot()
+                for pose in self._expert(now)[len(self._experts) : len(self.memory.estimates)]:
+                    self._experts.append((pose, now))
+        self._wall_seconds += wall.perf_counter() - began
+        return self.status
+
+    def run(self, on_event: Callable[[str], None] | None = None) -> EpisodeResult:
+        """Goes on until it is over, and judges.
+
+        Args:
+          on_event: called with one line of text for each phase and with the verdict.
+        """
+        shown = 0
+        while not self.over:
+            timeline = self.step().timeline
+            if on_event:
+                for entry in timeline[shown:]:
+                    on_event(f"  {entry}")
+            shown = len(timeline)
+        result = self.judge()
+        if on_event:
+            on_event(str(result))
+        return result
+
+    def _expert(self, snapshot: Snapshot) -> tuple[RigidTransform, ...]:
+        return self.task.expert(self.scene, snapshot.X_WO, snapshot.X_WE)
+
+    def judge(self) -> EpisodeResult:
+        """The verdict on what has happened so far."""
+        memory = self.memory
         status = memory.status
-        for entry in status.timeline[shown:]:
-            detail = f"  ({entry.detail})" if entry.detail else ""
-            on_event(f"  {entry.time:6.2f} s  {entry.phase.value}{detail}")
-        shown = len(status.timeline)
-        if memory.estimate is not None and at_inference is None:
-            at_inference = snapshots[-1]
-            expert = _expert_pose(task, episode, at_inference)
-        if end is None and status.phase.final:
-            end = snapshots[-1].time + (AFTER_DONE if status.phase is Phase.DONE else AFTER_HOLD)
-        if end is None and snapshots[-1].time >= time_limit:
-            break
-    wall_seconds = wall.perf_counter() - began
-    memory = episode.policy_memory()
-    status = memory.status
-    predicted = memory.chosen.X_WE if memory.chosen else None
-    if predicted is None and memory.estimate is not None:
-        predicted = RigidTransform(memory.estimate.poses[0])
-    result = replace(
-        result,
-        timeline=status.timeline,
-        estimate=memory.estimate,
-        energy=memory.chosen.energy if memory.chosen else None,
-        X_WE_predicted=predicted,
-        X_WE_expert=expert,
-        waypoints_reached=status.waypoints_reached,
-        target_points=memory.target_points,
-        grasped_points=memory.grasped_points_E,
-        opening_reached=memory.target.opening_reached,
-        inference_seconds=sum(status.inference_seconds) if status.inference_seconds else None,
-        build_seconds=build_seconds,
-        wall_seconds=wall_seconds,
-        simulated_seconds=snapshots[-1].time,
-    )
-    if predicted is not None and expert is not None and at_inference is not None:
-        family = episode.scene.privileged["shapes"]["target"].family
-        equivalents = equivalent_poses(
+        result = EpisodeResult(
+            task=self.task.name,
+            aligner=self.inference.name,
+            seed=self.seed,
+            split=self.split,
+            scenario=self.scenario.digest,
+            success=False,
+            timeline=status.timeline,
+            waypoints=self._waypoints(memory),
+            observations=memory.observations,
+            build_seconds=self._build_seconds,
+            wall_seconds=self._wall_seconds,
+            simulated_seconds=self.time,
+        )
+        if status.phase is Phase.DONE:
+            verdict = self.task.success(self.scene, self._snapshots)
+            result = replace(
+                result,
+                success=verdict.success,
+                reason=verdict.reason,
+                measures=dict(verdict.measures),
+                cause=None if verdict.success else Cause.CONTACT,
+            )
+        elif status.phase.final:
+            result = replace(result, cause=status.cause, reason=status.reason)
+        else:
+            where = status.step or f"{status.phase.value} {status.subject}".strip()
+            result = replace(
+                result,
+                cause=Cause.TIME,
+                reason=f"{where}: {self.time:g} s of simulated time are over",
+            )
+        return result if result.success else _name_alignment(result)
+
+    def _waypoints(self, memory: PolicyMemory) -> tuple[WaypointResult, ...]:
+        results = []
+        rows = zip(
+            self.task.motion.waypoints,
+            memory.estimates,
+            self._experts,
+            memory.status.inference_seconds,
+            strict=False,
+        )
+        for index, (motion, estimate, (expert, at_inference), seconds) in enumerate(rows):
+            chosen = memory.chosen[index] if index < len(memory.chosen) else None
+            predicted = RigidTransform(estimate.poses[0]) if chosen is None else chosen.X_WE
+            position, rotation = self._pose_error(motion, predicted, expert, at_inference)
+            reached = memory.status.waypoints_reached
+            results.append(
+                WaypointResult(
+                    name=motion.name,
+                    estimate=estimate,
+                    X_WE_predicted=predicted,
+                    energy=float(estimate.energies[0]) if chosen is None else chosen.energy,
+                    X_WE_expert=expert,
+                    position_error=position,
+                    rotation_error=rotation,
+                    inference_seconds=seconds,
+                    X_WE_reached=reached[index] if index < len(reached) else None,
+                )
+            )
+        return tuple(results)
+
+    def _pose_error(
+        self,
+        motion: WaypointMotion,
+        predicted: RigidTransform,
+        expert: RigidTransform,
+        at_inference: Snapshot,
+    ) -> tuple[float, float]:
+        """Position (m) and rotation (rad) error, up to the symmetries of hand and objects."""
+        roles = {plan.name: plan.role for plan in self.task.motion.observations}
+
+        def named(observation: str) -> str | None:
+            """The scene's object that an observation shows; None for the gripper."""
+            role = roles[observation]
+            return None if role == "gripper" else self.scene.with_role(role)[0].name
+
+        target = named(motion.target)
+        assert target is not None
+        return pose_error_at(
+            predicted,
             expert,
-            symmetries_E=task.motion.symmetries_E,
-            X_WB=at_inference.X_WO["target"] if family in ROUND_FAMILIES else None,
+            snapshot=at_inference,
+            shapes=self.scene.truth.shapes,
+            target=target,
+            held=named(motion.grasped),
+            symmetries_E=motion.symmetries_E,
         )
-        position, rotation = least_pose_error(predicted, equivalents)
-        result = replace(result, position_error=position, rotation_error=rotation)
-    result = _judge(result, task, episode, snapshots, time_limit)
-    on_event(_verdict_text(result))
-    return result
 
+    def demonstration(self) -> Demonstration:
+        """What the cameras and the arm recorded of the episode, without anything privileged.
 
-def _judge(
-    result: EpisodeResult,
-    task: Task,
-    episode: EpisodeDiagram,
-    snapshots: list[Snapshot],
-    time_limit: float,
-) -> EpisodeResult:
-    status = episode.policy_memory().status
-    if status.phase is Phase.DONE:
-        verdict = task.success(episode.scene, snapshots)
-        result = replace(
-            result,
-            success=verdict.success,
-            reason=verdict.reason,
-            measures={name: float(value) for name, value in verdict.measures.items()},
-            cause="" if verdict.success else "contact",
+        Raises `TaskError` unless all waypoints were reached.
+        """
+        memory, motions = self.memory, self.task.motion.waypoints
+        reached = memory.status.waypoints_reached
+        if len(reached) < len(motions):
+            raise TaskError(
+                f"{self.task.name}, seed {self.seed}: {len(reached)} of {len(motions)} waypoints "
+                "were reached: no demonstration"
+            )
+        kept = self._snapshots[::TRAJECTORY_STRIDE]
+        truth = self.scene.truth
+        return Demonstration(
+            observations=memory.observations,
+            waypoints=tuple(
+                Waypoint(
+                    name=motion.name,
+                    X_WE=X_WE.GetAsMatrix4(),
+                    opening=motion.opening_reached,
+                    grasped=motion.grasped,
+                    target=motion.target,
+                )
+                for motion, X_WE in zip(motions, reached, strict=True)
+            ),
+            trajectory=Trajectory(
+                times=np.array([s.time for s in kept]),
+                X_WE=np.stack([s.X_WE.GetAsMatrix4() for s in kept]),
+                openings=np.array([s.opening for s in kept]),
+            ),
+            provenance=Provenance(
+                source="simulated expert",
+                seed=self.seed,
+                scenario=self.scenario.digest,
+                sensors=self.scenario.camera_names,
+                instances={
+                    name: f"{shape.family} {truth.instance}"
+                    for name, shape in truth.shapes.items()
+                },
+                code=code_version(),
+            ),
         )
-    elif status.phase.final:
-        result = replace(result, cause=status.cause, reason=status.reason)
-    else:
-        where = status.step or status.phase.value
-        result = replace(
-            result, cause="time", reason=f"{where}: {time_limit:g} s of simulated time are over"
-        )
-    return result if result.success else _name_alignment(result)
 
 
 def _name_alignment(result: EpisodeResult) -> EpisodeResult:
     """A failure after a predicted pose that is far from the expert's is the alignment's."""
-    if result.cause == "perception" or result.position_error is None:
-        return result
-    assert result.rotation_error is not None
-    if result.position_error <= ALIGNED_POSITION and result.rotation_error <= ALIGNED_ROTATION:
+    worst = result.worst
+    if result.cause is Cause.PERCEPTION or worst is None or worst.aligned:
         return result
     reason = (
-        f"predicted pose {100 * result.position_error:.1f} cm and "
-        f"{np.degrees(result.rotation_error):.0f} deg from the expert's; then: {result.reason}"
+        f"{worst.name}: predicted pose {100 * worst.position_error:.1f} cm and "
+        f"{np.degrees(worst.rotation_error):.0f} deg from the expert's; then: {result.reason}"
     )
-    return replace(result, cause="alignment", reason=reason)
-
-
-def _verdict_text(result: EpisodeResult) -> str:
-    parts = []
-    if result.energy is not None:
-        parts.append(f"energy {result.energy:.3f}")
-    if result.position_error is not None and result.rotation_error is not None:
-        parts.append(
-            f"pose error {100 * result.position_error:.1f} cm "
-            f"{np.degrees(result.rotation_error):.0f} deg"
-        )
-    parts.append(
-        f"{result.simulated_seconds:.1f} s simulated in {result.wall_seconds:.1f} s "
-        f"(real-time factor {result.real_time_factor:.2f})"
-    )
-    verdict = "SUCCESS" if result.success else f"FAILURE ({result.cause}): {result.reason}"
-    return f"{verdict}\n  {', '.join(parts)}"
+    return replace(result, cause=Cause.ALIGNMENT, reason=reason)
 
 
 def record_demonstrations(
@@ -335,7 +545,7 @@ def record_demonstrations(
     *,
     count: int,
     first_seed: int = 0,
-    on_event: Callable[[str], None] = print,
+    on_event: Callable[[str], None] | None = print,
 ) -> DemonstrationSet:
     """Lets the expert do the task on demonstration objects until `count` episodes succeeded.
 
@@ -345,27 +555,15 @@ def record_demonstrations(
         raise TaskError(f"demonstrations: {count} asked for, at least 1 is needed")
     kept: list[Demonstration] = []
     for seed in range(first_seed, first_seed + 2 * count + 1):
-        result = run_episode(
-            scenario, seed=seed, aligner=EXPERT, split="demonstration", on_event=on_event
-        )
-        if result.success:
-            kept.append(to_demonstration(result))
+        if on_event:
+            on_event(f"{scenario.task.name}, seed {seed}, demonstration objects")
+        with Episode(scenario, seed=seed, aligner=EXPERT, split="demonstration") as episode:
+            if episode.run(on_event).success:
+                kept.append(episode.demonstration())
         if len(kept) == count:
             return DemonstrationSet(task=scenario.task.name, demonstrations=tuple(kept))
     raise TaskError(
         f"demonstrations: the expert succeeded in {len(kept)} of {2 * count + 1} attempts, "
         f"{count} are needed: try another --seed or see what fails with "
         "`iga simulate SCENARIO --aligner expert --split demonstration`"
-    )
-
-
-def to_demonstration(result: EpisodeResult) -> Demonstration:
-    """What the cameras and the arm recorded of an episode, without anything privileged."""
-    return Demonstration(
-        grasped=result.grasped_points,
-        target=result.target_points,
-        X_WE=np.stack([X_WE.GetAsMatrix4() for X_WE in result.waypoints_reached]),
-        openings=np.full(len(result.waypoints_reached), result.opening_reached),
-        names=(result.task,),
-        metadata={"seed": result.seed, "source": "simulated expert"},
     )

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from iga_drake.policy.motion import TaskMotion
+from iga_drake.policy.motion import ObservationPlan, TaskMotion, WaypointMotion
 from iga_drake.shapes.families import pan
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.panda.model import HOME_POSITION
 from iga_drake.station.simulated.scene import Scene, SceneObject
-from iga_drake.systems.ports import HAND_OPENING_MAX
+from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
 from iga_drake.tasks.task import (
     ROBOT,
     Snapshot,
@@ -54,15 +54,25 @@ class Grasp(Task):
 
     name = "grasp"
     motion = TaskMotion(
-        observes_grasped=False,
-        before_E=(0.0, 0.0, -0.10),
-        opening_approach=HAND_OPENING_MAX,
-        opening_reached=0.0,
-        settle=1.0,
-        after_W=(0.0, 0.0, LIFT),
-        symmetries_E=(
-            RigidTransform(),
-            RigidTransform(RotationMatrix.MakeZRotation(np.pi), [0, 0, 0]),
+        observations=(
+            ObservationPlan(name="gripper", role="gripper", frame="E"),
+            ObservationPlan(name="pan", role="target", frame="W"),
+        ),
+        waypoints=(
+            WaypointMotion(
+                name="grasp",
+                grasped="gripper",
+                target="pan",
+                before_E=(0.0, 0.0, -0.10),
+                opening_approach=HAND_OPENING_MAX,
+                opening_reached=0.0,
+                settle=1.0,
+                after_W=(0.0, 0.0, LIFT),
+                symmetries_E=(
+                    RigidTransform(),
+                    RigidTransform(RotationMatrix.MakeZRotation(np.pi), [0, 0, 0]),
+                ),
+            ),
         ),
     )
     observe_posture = np.array(HOME_POSITION)
@@ -91,7 +101,6 @@ class Grasp(Task):
             objects=(SceneObject(TARGET, "target", sdf, _place(shape, rng)),),
             panda_position=self.observe_posture.copy(),
             hand_opening=HAND_OPENING_MAX,
-            hand_command=HAND_OPENING_MAX,
             privileged={"task": self.name, "split": split, "instance": index, "shapes": shapes},
         )
 
@@ -103,7 +112,7 @@ class Grasp(Task):
         X_HE = RigidTransform(RotationMatrix.MakeXRotation(np.pi), [0, 0, 0])
         grasp = X_WO[TARGET] @ X_OH @ X_HE
         # The hand is the same turned by half a turn: take the pose that is nearer to now.
-        poses = [grasp @ X_EE for X_EE in self.motion.symmetries_E]
+        poses = [grasp @ X_EE for X_EE in self.motion.waypoints[0].symmetries_E]
         cosines = [
             pose.rotation().matrix()[:, 0] @ X_WE.rotation().matrix()[:, 0] for pose in poses
         ]

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from scipy.optimize import linprog
 
-from iga_drake.policy.motion import TaskMotion
+from iga_drake.policy.motion import ObservationPlan, TaskMotion, WaypointMotion
 from iga_drake.shapes.families import bowl
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
@@ -138,17 +138,31 @@ class Stack(Task):
     # The hand turned so that the bowl hangs in front of it, towards the first camera.
     observe_posture = np.array([*HOME_POSITION[:6], -np.pi / 4])
     motion = TaskMotion(
-        observes_grasped=True,
-        present=RigidTransform(
-            RotationMatrix(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])),
-            [0.44, 0.0, 0.42],
+        observations=(
+            ObservationPlan(name="bowl on the table", role="target", frame="W"),
+            ObservationPlan(
+                name="bowl in the hand",
+                role="grasped",
+                frame="E",
+                present=RigidTransform(
+                    RotationMatrix(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])),
+                    [0.44, 0.0, 0.42],
+                ),
+            ),
         ),
-        before_W=(0.0, 0.0, 0.10),
-        opening_approach=0.0,
-        opening_reached=RELEASE_OPENING,
-        settle=1.0,
-        contact_force=CONTACT_FORCE,
-        after_E=(0.0, 0.0, -0.12),
+        waypoints=(
+            WaypointMotion(
+                name="stack",
+                grasped="bowl in the hand",
+                target="bowl on the table",
+                before_W=(0.0, 0.0, 0.10),
+                opening_approach=0.0,
+                opening_reached=RELEASE_OPENING,
+                settle=1.0,
+                contact_force=CONTACT_FORCE,
+                after_E=(0.0, 0.0, -0.12),
+            ),
+        ),
     )
 
     def instances(self, split: Split) -> tuple[Mapping[str, ShapeInstance], ...]:
@@ -183,7 +197,6 @@ class Stack(Task):
             objects=objects,
             panda_position=self.observe_posture.copy(),
             hand_opening=opening + 0.0002,
-            hand_command=0.0,
             privileged={
                 "task": self.name,
                 "split": split,

@@ -1,5 +1,7 @@
 """Meshcat as the scenario wants it: a server on this machine, and what it shows."""
 
+from dataclasses import dataclass
+
 from pydrake.geometry import (
     Meshcat,
     MeshcatParams,
@@ -12,7 +14,29 @@ from pydrake.multibody.meshcat import ContactVisualizer, ContactVisualizerParams
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
-from iga_drake.station.scenario import Visualization
+from iga_drake.errors import check_range
+
+
+@dataclass
+class Visualization:
+    """What a person may look at while it runs."""
+
+    # Starts a Meshcat server (on this machine only).
+    meshcat: bool = False
+    # Its port; null takes the first free one from 7000 on.
+    port: int | None = None
+    # Time between two updates of the scene (s).
+    publish_period: float = 1.0 / 32.0
+    # Also shows collision geometry (hidden at first) and contact forces.
+    proximity: bool = True
+    contacts: bool = False
+
+    def check(self, where: str = "visualization") -> None:
+        """Raises `ConfigError` for a value out of range."""
+        period, port = self.publish_period, self.port
+        check_range(period > 0, f"{where}.publish_period", period, "> 0")
+        valid = port is None or port == 0 or 1024 <= port <= 65535
+        check_range(valid, f"{where}.port", port, "null, 0 (any free one), or 1024..65535")
 
 
 def start_meshcat(config: Visualization) -> Meshcat:

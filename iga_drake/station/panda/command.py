@@ -5,7 +5,9 @@ import math
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from iga_drake.systems.ports import HAND_OPENING_MAX, PANDA_JOINTS
+from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
+from iga_drake.station.scenario import Panda
+from iga_drake.systems.ports import PANDA_JOINTS
 
 _ACTUATORS = PANDA_JOINTS + 2
 
@@ -27,8 +29,8 @@ class PandaCommand(LeafSystem):
       clipped to what the hand can do.
     - `desired_state` (18): positions, then velocities of the nine actuators, for the plant's
       `get_desired_state_input_port`. A joint follows its command as a first-order lag of
-      `time_constant`, with the velocity that belongs to it; the opening changes by at most
-      `opening_speed`. While no command has been seen, it is the command itself at rest.
+      `Panda.time_constant`, with the velocity that belongs to it; the opening changes by at most
+      `Panda.opening_speed`. While no command has been seen, it is the command itself at rest.
     - `hand.opening_commanded` (1, m): the opening that the fingers are told now.
 
     The fingers go on pressing against an object because their desired position moves on past it,
@@ -37,17 +39,18 @@ class PandaCommand(LeafSystem):
 
     def __init__(
         self,
+        panda: Panda | None = None,
         *,
-        time_step: float = 0.002,
-        time_constant: float = 0.01,
-        opening_speed: float = 0.1,
+        time_step: float,
     ) -> None:
-        """`time_step` (s) of the plant, `time_constant` (s), `opening_speed` (m/s)."""
+        """`time_step` (s) is the plant's. Raises `ConfigError`."""
         super().__init__()
+        panda = panda or Panda()
+        panda.check("Panda")
         self.set_name("PandaCommand")
         self._time_step = time_step
-        self._gain = 1.0 - np.exp(-time_step / time_constant)
-        self._opening_step = opening_speed * time_step
+        self._gain = 1.0 - np.exp(-time_step / panda.time_constant)
+        self._opening_step = panda.opening_speed * time_step
         self._position_input = self.DeclareVectorInputPort("panda.position", PANDA_JOINTS)
         self._opening_input = self.DeclareVectorInputPort("hand.opening", 1)
         # The desired state; NaN until the first command.

@@ -26,7 +26,8 @@ from pydrake.systems.framework import Context
 from iga_drake.errors import IgaDrakeError
 from iga_drake.paths import models_dir
 from iga_drake.station.panda.visuals import mesh_visuals
-from iga_drake.systems.ports import HAND_OPENING_MAX, PANDA_JOINTS
+from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
+from iga_drake.systems.ports import PANDA_JOINTS
 
 Visuals = Literal["primitives", "meshes", "auto", "none"]
 

@@ -28,9 +28,7 @@ class Scene:
     objects: tuple[SceneObject, ...]
     # Joint angles at the start (rad).
     panda_position: np.ndarray
-    # Opening of the hand at the start (m). The hand's controller starts with this command.
+    # Opening of the hand at the start (m).
     hand_opening: float
-    # Command for the hand at the start (m); below `hand_opening` where an object is already held.
-    hand_command: float | None = None
     # Anything a success predicate or an expert needs (privileged: never seen by the policy).
     privileged: dict = field(default_factory=dict)

@@ -18,26 +18,19 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import MatrixGain
 from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
 
-from iga_drake.errors import IgaDrakeError
+from iga_drake.station.contract import CHEAT, StationError
 from iga_drake.station.panda.command import PandaCommand
 from iga_drake.station.panda.model import PandaModel, Visuals, add_panda
 from iga_drake.station.scenario import Scenario, Table
-from iga_drake.station.simulated.cameras import add_camera, add_renderer
+from iga_drake.station.cameras.rgbd import add_renderer
 from iga_drake.station.simulated.scene import Scene, SceneObject
-from iga_drake.systems.ports import HAND_OPENING_MAX, PANDA_JOINTS, Role, station_ports
+from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
+from iga_drake.systems.ports import PANDA_JOINTS, Role, station_ports
 from iga_drake.systems.segmentation import Segmentation
 from iga_drake.viewing.meshcat import add_visualizers
 
-# Ports that no hardware has start with this: only experts, success predicates and tests use them.
-CHEAT = "cheat."
-
-
-class StationError(IgaDrakeError):
-    """A scene can't be built into a station, or a station breaks the port contract."""
-
-
 def build_simulation_station(
-    scenario: Scenario, scene: Scene, *, seed: int, meshcat: Meshcat | None = None
+    scenario: Scenario, *, scene: Scene | None, seed: int, meshcat: Meshcat | None = None
 ) -> Diagram:
     """Builds the diagram "station".
 
@@ -54,6 +47,8 @@ def build_simulation_station(
     Raises:
       StationError: the scene holds what can't be built; the message names the object.
     """
+    if scene is None:
+        raise StationError("the simulated station needs a scene: what lies where at the start")
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(config=scenario.plant, builder=builder)
     plant.set_name("plant")
@@ -69,12 +64,8 @@ def build_simulation_station(
     _add_robot_ports(builder, plant, panda, scenario)
     add_renderer(scene_graph)
     for index, (name, camera) in enumerate(scenario.cameras.items()):
-        ports = add_camera(
-            builder,
-            scene_graph,
-            name=name,
-            camera=camera,
-            seed=(seed + scenario.seeds.cameras, index),
+        ports = camera.add(
+            builder, scene_graph, name=name, seed=(seed + scenario.seeds.cameras, index)
         )
         size = {"width": camera.intrinsics.width, "height": camera.intrinsics.height}
         segmentation = builder.AddNamedSystem(f"{name}.segmentation", Segmentation(roles, **size))
@@ -94,49 +85,7 @@ def build_simulation_station(
 
     station = builder.Build()
     station.set_name("station")
-    check_port_contract(station, scenario.camera_names)
     return station
-
-
-def check_port_contract(station: Diagram, cameras: tuple[str, ...]) -> None:
-    """Raises `StationError` unless `station` exports exactly the contract (`cheat.` ports aside).
-
-    Compares names, directions, the sizes of vectors and the kinds of abstract values.
-    """
-    found = {}
-    for i in range(station.num_input_ports()):
-        port = station.get_input_port(i)
-        found[port.get_name()] = ("input", _kind(port))
-    for i in range(station.num_output_ports()):
-        port = station.get_output_port(i)
-        if not port.get_name().startswith(CHEAT):
-            found[port.get_name()] = ("output", _kind(port))
-    wanted = {p.name: (p.direction, p.kind) for p in station_ports(cameras)}
-    problems = [f"'{n}' is missing" for n in wanted if n not in found]
-    problems += [f"'{n}' is not in the contract" for n in found if n not in wanted]
-    problems += [
-        f"'{n}' is {found[n]}, the contract says {wanted[n]}"
-        for n in wanted
-        if n in found and found[n] != wanted[n]
-    ]
-    if problems:
-        raise StationError(f"station '{station.get_name()}': " + "; ".join(problems))
-
-
-_KINDS = {
-    ImageRgba8U: "ImageRgba8U",
-    ImageDepth32F: "ImageDepth32F",
-    ImageLabel16I: "ImageLabel16I",
-    RigidTransform: "RigidTransform",
-}
-
-
-def _kind(port: InputPort | OutputPort) -> str:
-    """The contract's word for what a port carries."""
-    if port.get_data_type() == PortDataType.kVectorValued:
-        return f"vector({port.size()})"
-    value = type(port.Allocate().get_value())
-    return _KINDS.get(value, value.__name__)
 
 
 _ROLES = {"target": Role.TARGET, "grasped": Role.GRASPED, "other": Role.BACKGROUND}
@@ -196,7 +145,8 @@ def _add_robot_ports(
     """Connects the arm's and the hand's commands and measurements."""
     instance = panda.instance
     command = builder.AddNamedSystem(
-        "panda.command", PandaCommand(time_step=scenario.plant.time_step)
+        "panda.command",
+        PandaCommand(scenario.panda, time_step=scenario.plant.time_step),
     )
     builder.Connect(
         command.GetOutputPort("desired_state"), plant.get_desired_state_input_port(instance)

@@ -7,6 +7,7 @@ sigma = 0.0024 z^2 (m): 1.5 mm at 0.8 m.
 """
 
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
@@ -15,7 +16,70 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
-from iga_drake.station.scenario import CalibrationError, DepthNoise
+from iga_drake.errors import check_range
+
+@dataclass
+class DepthNoise:
+    """How a depth image gets worse than the rendered one; formulas in `noisy_depth`."""
+
+    # Gaussian noise whose deviation grows with the square of the distance.
+    gaussian: bool = True
+    # Deviation at a distance of 1 m (m), >= 0.
+    sigma_at_one_metre: float = 0.0024
+    # Pixels beside a jump in depth get lost.
+    dropouts: bool = True
+    # Chance that such a pixel is lost, in [0, 1].
+    dropout_probability: float = 0.5
+    # A jump is a difference between neighbours above this (m), > 0.
+    dropout_jump: float = 0.02
+    # Depth comes in whole steps.
+    quantisation: bool = True
+    # The step (m), > 0.
+    quantisation_step: float = 0.001
+    # Time for which the noise of one image stays the same: one over the frame rate (s), > 0.
+    frame_period: float = 1.0 / 30.0
+
+    def check(self, where: str) -> None:
+        """Raises `ConfigError` for a value out of range."""
+        sigma, share = self.sigma_at_one_metre, self.dropout_probability
+        check_range(sigma >= 0, f"{where}.sigma_at_one_metre", sigma, ">= 0")
+        check_range(0 <= share <= 1, f"{where}.dropout_probability", share, "0..1")
+        for name in ("dropout_jump", "quantisation_step", "frame_period"):
+            check_range(getattr(self, name) > 0, f"{where}.{name}", getattr(self, name), "> 0")
+
+
+@dataclass
+class CalibrationError:
+    """How far the exported camera pose is from the true one."""
+
+    # Whether there is an error at all.
+    enabled: bool = True
+    # Every point of the work area is displaced by at least and at most this (m),
+    # 0 <= minimum <= maximum. Drawn once for a seed.
+    minimum: float = 0.002
+    maximum: float = 0.005
+    # Angle of the rotation part (rad), >= 0; `rotation * radius` at most (maximum - minimum) / 2.
+    rotation: float = 0.002
+    # The work area is the ball around this point of W (m), the rotation's pivot...
+    center: list[float] = field(default_factory=lambda: [0.5, 0.0, 0.15])
+    # ...with this radius (m), > 0.
+    radius: float = 0.35
+
+    def check(self, where: str) -> None:
+        """Raises `ConfigError` for a value out of range."""
+        check_range(len(self.center) == 3, f"{where}.center", self.center, "3 numbers")
+        check_range(self.radius > 0, f"{where}.radius", self.radius, "> 0")
+        least, most = self.minimum, self.maximum
+        check_range(0 <= least <= most, f"{where}.minimum", least, f"0..maximum = {most}")
+        turn = (most - least) / 2 / self.radius
+        check_range(
+            0 <= self.rotation <= turn + 1e-12,
+            f"{where}.rotation",
+            self.rotation,
+            f"0..(maximum - minimum) / (2 radius) = {turn:.4g} rad",
+        )
+
+
 
 # A lost pixel, as RealSense cameras report it (Drake: ImageDepth32F's "too close").
 LOST = 0.0

@@ -1,0 +1,81 @@
+"""The process in which an aligner runs beside the control loop: `python -m iga_drake.policy.worker
+FD`, started by `WorkerInference` with a pipe of its own.
+
+First comes a message with the aligner's name, its options and the demonstrations' contexts, then
+one message a question; each is answered with an estimate or with an error. What an aligner prints
+goes to the standard error stream. The process ends when its pipe is closed.
+"""
+
+import os
+import sys
+import threading
+import time
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from typing import Any
+
+import numpy as np
+
+from iga_drake.errors import error_text
+
+_NICENESS = 5  # the control loop comes first
+
+
+def _receive(connection: Connection, messages: "SimpleQueue[dict[str, Any]]") -> None:
+    """Passes messages on, and ends the process when nobody listens any more, whatever it does."""
+    while True:
+        try:
+            messages.put(connection.recv())
+        except (EOFError, OSError):
+            os._exit(0)
+
+
+def main(descriptor: int) -> None:
+    """Serves the questions that come through the pipe with this file descriptor."""
+    connection = Connection(descriptor)
+    os.nice(_NICENESS)
+    sys.stdout = sys.stderr
+    messages: SimpleQueue[dict[str, Any]] = SimpleQueue()
+    threading.Thread(target=_receive, args=(connection, messages), daemon=True).start()
+    first = messages.get()
+    aligner, contexts, failed = None, [], ""
+    try:
+        from iga_drake.aligners.registry import make_aligner
+        from iga_drake.demonstrations.alignment import Alignment
+
+        contexts = [
+            tuple(Alignment(grasped, target) for grasped, target in context)
+            for context in first["contexts"]
+        ]
+        aligner = make_aligner(first["aligner"], **first["options"])
+    except Exception as error:
+        failed = error_text(error)
+    while True:
+        asked = messages.get()
+        answer: dict[str, Any] = {"error": failed}
+        if aligner is not None:
+            began = time.perf_counter()
+            try:
+                estimate = aligner.align(
+                    contexts[asked["waypoint"]],
+                    asked["grasped"],
+                    asked["target"],
+                    seed=asked["seed"],
+                )
+                familiarity = estimate.familiarity
+                answer = {
+                    "estimate": {
+                        "poses": np.asarray(estimate.poses),
+                        "energies": np.asarray(estimate.energies),
+                        "probabilities": np.asarray(estimate.probabilities),
+                        "familiarity": None if familiarity is None else float(familiarity),
+                    },
+                    "seconds": time.perf_counter() - began,
+                }
+            except Exception as error:
+                answer = {"error": error_text(error)}
+        connection.send(answer)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))
