@@ -1,4 +1,4 @@
-"""The README's smaller commands do what it says, through the `iga` command itself."""
+"""The smaller documented commands do what the pages say, through the `iga` command itself."""
 
 import json
 from pathlib import Path
