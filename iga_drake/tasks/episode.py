@@ -10,8 +10,8 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 
-from iga_drake.aligners.protocol import Aligner, AlignerError, PoseEstimate
-from iga_drake.aligners.registry import make_aligner
+from iga_drake.aligners.protocol import Aligner, PoseEstimate
+from iga_drake.aligners.registry import EXPERT, make_aligner
 from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.demonstrations.demonstration import (
     Demonstration,
@@ -26,7 +26,6 @@ from iga_drake.tasks.registry import make_task
 from iga_drake.tasks.robot_diagram import EpisodeDiagram, build_episode_diagram
 from iga_drake.tasks.task import Snapshot, Split, Task, TaskError
 
-EXPERT = "expert"
 # How many of the demonstrations make up the context.
 CONTEXT_SIZE = 3
 # Keeps the cameras' seeds of test episodes apart from those of demonstrations.
@@ -190,12 +189,7 @@ def _choose_aligner(scenario: Scenario, aligner: str | Aligner | None) -> Aligne
     if name == EXPERT:
         return ExpertAligner()
     options = scenario.aligner.options if name == scenario.aligner.name else {}
-    try:
-        return make_aligner(name, **options)
-    except TypeError as error:
-        raise AlignerError(
-            f"aligner.options {options}: '{name}' does not take them: {error}"
-        ) from error
+    return make_aligner(name, **options)
 
 
 def _expert_pose(task: Task, episode: EpisodeDiagram, snapshot: Snapshot) -> RigidTransform:
