@@ -1,7 +1,7 @@
 """Checkpoints as safetensors with their description inside; written whole or not at all."""
 
+import hashlib
 import json
-import os
 from pathlib import Path
 
 import torch
@@ -9,6 +9,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from iga_drake.errors import IgaDrakeError
+from iga_drake.files import replacing
 
 FORMAT = "iga-drake-checkpoint"
 VERSION = 1
@@ -19,12 +20,11 @@ class CheckpointError(IgaDrakeError):
 
 
 def save_checkpoint(path: Path, tensors: dict[str, torch.Tensor], *, kind: str, card: dict) -> None:
-    """Writes `tensors` with a JSON `card` to `path` (temporary file, then renamed)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Writes `tensors` with a JSON `card` to `path` (whole or not at all)."""
     metadata = {"format": FORMAT, "version": str(VERSION), "kind": kind, "card": json.dumps(card)}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, temporary, metadata)
-    os.replace(temporary, path)
+    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    with replacing(path) as partial:
+        save_file(plain, partial, metadata)
 
 
 def load_checkpoint(path: Path, *, kind: str) -> tuple[dict[str, torch.Tensor], dict]:
@@ -51,3 +51,17 @@ def load_checkpoint(path: Path, *, kind: str) -> tuple[dict[str, torch.Tensor], 
             return tensors, json.loads(metadata["card"])
     except (SafetensorError, OSError, ValueError, KeyError) as error:
         raise CheckpointError(f"{path}: damaged or not a safetensors file ({error})") from error
+
+
+def file_digest(path: Path) -> str:
+    """First 16 hexadecimal digits of the SHA-256 of a file: what results with it are known by."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def network_digest(network: torch.nn.Module) -> str:
+    """First 16 hexadecimal digits of the SHA-256 of a network's tensors, by name."""
+    found = hashlib.sha256()
+    for name, tensor in sorted(network.state_dict().items()):
+        found.update(f"{name} {tensor.dtype} {tuple(tensor.shape)} ".encode())
+        found.update(tensor.detach().cpu().reshape(-1).view(torch.uint8).numpy().tobytes())
+    return found.hexdigest()[:16]

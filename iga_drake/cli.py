@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from iga_drake.errors import IgaDrakeError
-from iga_drake.paths import write_text
+from iga_drake.files import write_text
 
 SUCCESS, FAILURE, BAD_INPUT = 0, 1, 2
 ALIGNERS = ("icp", "iga", "iga-energy", "iga-paper", "dirreg", "dfm", "expert")

@@ -1,4 +1,4 @@
-"""Where the repository's data folders lie, in an installed wheel and in a checkout; whole files."""
+"""Where the repository's data folders lie, in an installed wheel and in a checkout."""
 
 import os
 from pathlib import Path
@@ -34,14 +34,3 @@ def cache_dir() -> Path:
     path = Path(root) / "iga_drake"
     path.mkdir(parents=True, exist_ok=True)
     return path
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes under a temporary name and renames, so that nobody sees half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

@@ -18,7 +18,10 @@ ORDER = (
     "systems", "policy", "viewing", "station", "tasks", "evaluation", "studies",
 )  # fmt: skip
 # Usable by every package.
-ROOT_MODULES = {f"iga_drake.{name}" for name in ("checkpoint", "errors", "paths", "precision")}
+ROOT_MODULES = {
+    f"iga_drake.{name}"
+    for name in ("checkpoint", "errors", "files", "paths", "precision", "registry")
+}
 WITHOUT_DRAKE = ORDER[: ORDER.index("planning")]
 
 

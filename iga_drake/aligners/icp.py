@@ -106,3 +106,6 @@ class IcpAligner:
         energy = np.array(energies)[order]
         probability = np.exp(-(energy - energy[0]) / 0.1)
         return PoseEstimate(np.array(poses)[order], energy, probability / probability.sum())
+
+
+ALIGNERS = {"icp": IcpAligner}

@@ -1,59 +1,49 @@
-"""Aligners by name."""
+"""Aligners by name: those of this package's modules, and those that other packages install.
 
-from collections.abc import Callable
+To add one, write a module here with `ALIGNERS = {"name": factory}`, or state an entry point of the
+group `iga_drake.aligners`. A factory takes the aligner's options as keywords.
+"""
+
 from typing import Any
 
 from iga_drake.aligners.protocol import Aligner, AlignerError
+from iga_drake.registry import Registry
+
+# Names that stand beside aligners and that no aligner may take: the scripted expert of episodes,
+# which sees the true state, and the oracle of generated samples, which knows their surfaces.
+EXPERT, ORACLE = "expert", "oracle"
+
+_REGISTRY: Registry[Aligner] = Registry(
+    "aligner",
+    package="iga_drake.aligners",
+    attribute="ALIGNERS",
+    group="iga_drake.aligners",
+    error=AlignerError,
+    reserved=(EXPERT, ORACLE),
+)
 
 
-def _icp(**options: Any) -> Aligner:
-    from iga_drake.aligners.icp import IcpAligner
-
-    return IcpAligner(**options)
-
-
-def _iga(**options: Any) -> Aligner:
-    from iga_drake.aligners.iga.aligner import IgaAligner
-
-    return IgaAligner(**options)
+def aligner_names() -> list[str]:
+    """The names that `make_aligner` takes, sorted; no network is loaded."""
+    return _REGISTRY.names()
 
 
-def _iga_energy(**options: Any) -> Aligner:
-    from iga_drake.aligners.iga.aligner import IgaAligner, IgaConfig
-
-    return IgaAligner(config=IgaConfig(ranking="energy"), **options)
-
-
-def _iga_paper(**options: Any) -> Aligner:
-    from iga_drake.aligners.iga_paper.aligner import IgaPaperAligner
-
-    return IgaPaperAligner(**options)
-
-
-def _dirreg(**options: Any) -> Aligner:
-    from iga_drake.aligners.iga_paper.variants import DirRegAligner
-
-    return DirRegAligner(**options)
-
-
-def _dfm(**options: Any) -> Aligner:
-    from iga_drake.aligners.iga_paper.variants import DfmAligner
-
-    return DfmAligner(**options)
-
-
-ALIGNERS: dict[str, Callable[..., Aligner]] = {
-    "icp": _icp,
-    "iga": _iga,
-    "iga-energy": _iga_energy,
-    "iga-paper": _iga_paper,
-    "dirreg": _dirreg,
-    "dfm": _dfm,
-}
+def check_aligner(name: str) -> None:
+    """Raises `AlignerError`, which lists the known names, where `name` isn't among them."""
+    _REGISTRY.check(name)
 
 
 def make_aligner(name: str, **options: Any) -> Aligner:
-    """The aligner `name` with its constructor's keyword options; `AlignerError` lists the names."""
-    if name not in ALIGNERS:
-        raise AlignerError(f"aligner '{name}' is not known; one of: {', '.join(sorted(ALIGNERS))}")
-    return ALIGNERS[name](**options)
+    """The aligner `name` with its own keyword options.
+
+    Raises `AlignerError` for an unknown name and for options that the aligner doesn't take.
+    """
+    factory = _REGISTRY.factory(name)
+    try:
+        return factory(**options)
+    except TypeError as error:
+        if not options:
+            raise
+        raise AlignerError(
+            f"aligner options {options}: '{name}' does not take them: {error}"
+        ) from error

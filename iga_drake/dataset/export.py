@@ -7,7 +7,6 @@ JSON. A shard's bytes depend on its samples alone, wherever they were made.
 import dataclasses
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from iga_drake.dataset.loader import SampleDataset, collate, sample_loader
 from iga_drake.dataset.samples import Sample, SampleConfig, make_sample
 from iga_drake.dataset.splits import sample_set
 from iga_drake.errors import IgaDrakeError
+from iga_drake.files import write_bytes
 
 FORMAT = "iga-drake-samples"
 VERSION = 1
@@ -229,7 +229,7 @@ def export_shards(
             for start in range(0, len(missing), _ROUND * width):
                 part = missing[start : start + _ROUND * width]
                 for shard, data in zip(part, run(part), strict=True):
-                    _write(_file(out, shard, shard_size), data)
+                    write_bytes(_file(out, shard, shard_size), data)
                     sums[shard.first] = hashlib.sha256(data).hexdigest()
                 _write_manifest(out, manifest, shards, sums)
                 if progress is not None:
@@ -288,13 +288,7 @@ def _write_manifest(
         if sums[shard.first]
     ]
     text = json.dumps({**manifest, "shards": rows}, indent=1) + "\n"
-    _write(out / MANIFEST, text.encode())
-
-
-def _write(path: Path, data: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)
+    write_bytes(out / MANIFEST, text.encode())
 
 
 def _finished(path: Path, shard: _Shard) -> str:

@@ -17,6 +17,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from iga_drake.files import write_text
 from iga_drake.shapes.instance import ShapeError, ShapeInstance
 
 _CREASE = np.radians(40.0)
@@ -74,12 +75,7 @@ def write_sdf_file(
         instance, meshes.name, name=name, color=color, friction=friction, frames=instance.frames
     )
     path = folder / f"{name}.sdf"
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_text(path, text)
     return path
 
 

@@ -41,8 +41,9 @@ from iga_drake.dataset.samples import SampleConfig
 from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.alignment import digest
+from iga_drake.files import write_text
 from iga_drake.geometry.se3 import rigid
-from iga_drake.paths import models_dir, write_text
+from iga_drake.paths import models_dir
 from iga_drake.training.descriptor import DescriptorTraining, train_descriptor, validate
 from iga_drake.training.energy import VALIDATION as ENERGY_SET
 from iga_drake.training.energy import EnergyTraining, train_energy

@@ -154,3 +154,6 @@ def _place(shape: ShapeInstance, rng: np.random.Generator) -> RigidTransform:
         p_WH = X_WO.multiply(p_OH)
         if _REACH[0] <= np.hypot(p_WH[0], p_WH[1]) <= _REACH[1] and p_WH[0] > 0.2:
             return X_WO
+
+
+TASKS = {Grasp.name: Grasp}

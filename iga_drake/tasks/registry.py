@@ -1,14 +1,26 @@
-"""The tasks by name."""
+"""Tasks by name: those of this package's modules, and those that other packages install.
 
-from iga_drake.tasks.grasp import Grasp
-from iga_drake.tasks.stack import Stack
+To add one, write a module here with `TASKS = {"name": factory}`, or state an entry point of the
+group `iga_drake.tasks`. A factory, such as a subclass of `Task`, is called without arguments.
+"""
+
+from iga_drake.registry import Registry
 from iga_drake.tasks.task import Task, TaskError
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (Grasp, Stack)}
+_REGISTRY: Registry[Task] = Registry(
+    "task",
+    package="iga_drake.tasks",
+    attribute="TASKS",
+    group="iga_drake.tasks",
+    error=TaskError,
+)
+
+
+def task_names() -> list[str]:
+    """The names that `make_task` takes, sorted."""
+    return _REGISTRY.names()
 
 
 def make_task(name: str) -> Task:
     """The task called `name`; `TaskError` lists the names that there are."""
-    if name not in TASKS:
-        raise TaskError(f"unknown task '{name}': the tasks are {', '.join(sorted(TASKS))}")
-    return TASKS[name]()
+    return _REGISTRY.factory(name)()

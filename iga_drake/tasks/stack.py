@@ -274,3 +274,6 @@ def _place(rng: np.random.Generator) -> RigidTransform:
         if _REACH[0] <= np.hypot(x, y) <= _REACH[1]:
             yaw = rng.uniform(-np.pi, np.pi)
             return RigidTransform(RollPitchYaw(0, 0, yaw), [x, y, _CLEARANCE])
+
+
+TASKS = {Stack.name: Stack}

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from iga_drake.files import write_text
 from iga_drake.training.settings import TrainingError
 
 FILE = "log.jsonl"
@@ -24,9 +25,7 @@ class TrainingLog:
         path = folder / FILE
         if path.is_file():
             kept = [line for line in path.read_text("utf-8").splitlines() if _step(line) <= step]
-            temporary = path.with_name(f".{path.name}.tmp")
-            temporary.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
-            os.replace(temporary, path)
+            write_text(path, "".join(line + "\n" for line in kept))
         self._file = path.open("a", encoding="utf-8")
         self._events: Any = None
         if tensorboard:

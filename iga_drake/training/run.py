@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from iga_drake.checkpoint import load_checkpoint, save_checkpoint
+from iga_drake.files import PARTIAL
 from iga_drake.training.log import TrainingLog, resident_memory
 from iga_drake.training.muon import Muon
 from iga_drake.training.ranks import Ranks
@@ -168,7 +169,7 @@ class TrainingRun:
         self._log: TrainingLog | None = None
         if self.ranks.first:
             folder.mkdir(parents=True, exist_ok=True)
-            left_over = folder.glob(".*.safetensors.*.tmp")  # by a process that was killed
+            left_over = folder.glob(f".*.safetensors.*{PARTIAL}")  # by a process that was killed
             for path in left_over:
                 path.unlink(missing_ok=True)
             self._log = TrainingLog(folder, self.step, tensorboard=self._options.tensorboard)

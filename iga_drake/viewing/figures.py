@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from iga_drake.errors import IgaDrakeError
+from iga_drake.files import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,5 +36,5 @@ def new_figure(rows: int, columns: int, *, inches: float = 3.4) -> "tuple[Figure
 
 def write_figure(figure: "Figure", path: Path, *, dpi: int = 130) -> None:
     """Writes a PNG file; missing folders are made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=dpi)
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=dpi, format="png")

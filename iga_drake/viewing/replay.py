@@ -1,6 +1,5 @@
 """Pictures of an episode and of demonstrations, in Meshcat and as pages that need no server."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.perception import BaseField, Fields, PointCloud
 
 from iga_drake.demonstrations.demonstration import DemonstrationSet
+from iga_drake.files import write_text
 
 TARGET_COLOR = Rgba(0.10, 0.45, 0.85, 1.0)
 GRASPED_COLOR = Rgba(0.95, 0.55, 0.10, 1.0)
@@ -70,14 +70,7 @@ def show_prediction(
 
 def write_html(meshcat: Meshcat, path: Path | str) -> None:
     """Writes all that Meshcat shows, recordings included, as one page; whole or not at all."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        partial.write_text(meshcat.StaticHtml(), encoding="utf-8")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_text(Path(path), meshcat.StaticHtml())
 
 
 def show_demonstrations(

@@ -7,7 +7,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from rest import Rest
 
-from iga_drake.tasks.registry import TASKS, make_task
+from iga_drake.tasks.registry import make_task, task_names
 from iga_drake.tasks.task import (
     ROBOT,
     TABLE,
@@ -20,7 +20,7 @@ from iga_drake.tasks.task import (
 )
 
 
-@pytest.fixture(params=sorted(TASKS))
+@pytest.fixture(params=task_names())
 def task(request: pytest.FixtureRequest) -> Task:
     return make_task(request.param)
 

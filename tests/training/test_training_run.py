@@ -180,7 +180,7 @@ def test_a_run_killed_at_any_moment_ends_as_if_it_had_not_been(tmp_path: Path) -
     assert 3 <= state(killed)[1]["step"] < 7
     with (killed / "log.jsonl").open("a") as file:
         file.write('{"loss": 1.2')
-    (killed / f".state.safetensors.{os.getpid()}.tmp").write_bytes(b"half")
+    (killed / f".state.safetensors.{os.getpid()}.partial").write_bytes(b"half")
     process = command("--out", killed, *options)
     out, _ = process.communicate()
     assert process.returncode == 0 and "step 7, 14 samples seen" in out

@@ -5,11 +5,11 @@ They are looked at, and nothing else: no mass, contact or cloud depends on them.
 
 import importlib.util
 import math
-import os
 import sys
 from functools import cache
 from pathlib import Path
 
+from iga_drake.files import write_bytes
 from iga_drake.paths import cache_dir
 
 # Link -> mesh of the package. The right finger is the left one turned, which the loader does.
@@ -56,6 +56,4 @@ def _convert(source: Path, target: Path) -> None:
         material.metallicFactor, material.roughnessFactor = 0.0, 0.6
     scene.apply_transform(trimesh.transformations.rotation_matrix(-math.pi / 2, [1, 0, 0]))
     files = trimesh.exchange.gltf.export_gltf(scene, embed_buffers=True)
-    part = target.with_suffix(f".{os.getpid()}.part")
-    part.write_bytes(files["model.gltf"])
-    part.replace(target)
+    write_bytes(target, files["model.gltf"])
