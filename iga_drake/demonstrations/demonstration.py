@@ -43,7 +43,6 @@ def _finite(name: str, value: object, shape: tuple[int | None, ...]) -> np.ndarr
             f"{name}: {bad} of {array.size} numbers are NaN or infinite, all must be finite: "
             "record the demonstration again"
         )
-    array.flags.writeable = False
     return array
 
 
@@ -128,9 +127,7 @@ class Trajectory:
     def __post_init__(self) -> None:
         times = _finite("trajectory: times", self.times, (None,))
         object.__setattr__(self, "times", times)
-        object.__setattr__(
-            self, "X_WE", _finite("trajectory: X_WE", self.X_WE, (len(times), 4, 4))
-        )
+        object.__setattr__(self, "X_WE", _finite("trajectory: X_WE", self.X_WE, (len(times), 4, 4)))
         openings = _finite("trajectory: openings", self.openings, (len(times),))
         object.__setattr__(self, "openings", openings)
         if (np.diff(times) < 0).any():
@@ -265,4 +262,3 @@ class DemonstrationSet:
                 "ask for fewer or record more with `iga demonstrate`"
             )
         return DemonstrationSet(task=self.task, demonstrations=self.demonstrations[:count])
-

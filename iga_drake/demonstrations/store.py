@@ -266,9 +266,7 @@ def _read_arrays(path: Path, where: str, entry: dict[str, Any]) -> dict[str, np.
     return arrays
 
 
-def _make(
-    where: str, entry: dict[str, Any], arrays: dict[str, np.ndarray]
-) -> Demonstration:
+def _make(where: str, entry: dict[str, Any], arrays: dict[str, np.ndarray]) -> Demonstration:
     """The demonstration of one manifest entry and its arrays."""
 
     def array(name: str) -> np.ndarray:

@@ -38,7 +38,7 @@ class InferenceAnswer:
     seconds: float  # wall-clock time that the aligner took
 
 
-class InferenceFailure(Exception):  # noqa: N818
+class InferenceFailure(Exception):
     """There is no answer; the message is the reason."""
 
     def __init__(self, reason: str, cause: Cause = Cause.ALIGNMENT) -> None:
@@ -76,9 +76,7 @@ class Inference(Protocol):
 def checked_answer(name: str, found: Any, seconds: float) -> InferenceAnswer:
     """`found`, what an aligner returned, as an answer; `InferenceFailure` if it isn't one."""
     try:
-        estimate = PoseEstimate(
-            found.poses, found.energies, found.probabilities, found.familiarity
-        )
+        estimate = PoseEstimate(found.poses, found.energies, found.probabilities, found.familiarity)
     except Exception as error:
         raise InferenceFailure(
             f"aligner {name}: returned {type(found).__name__}, a PoseEstimate is expected ({error})"
@@ -88,11 +86,7 @@ def checked_answer(name: str, found: Any, seconds: float) -> InferenceAnswer:
         raise InferenceFailure(f"aligner {name}: poses or energies are not finite")
     R = estimate.poses[:, :3, :3]
     off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max()
-    if (
-        off > _RIGID
-        or (np.linalg.det(R) < 0).any()
-        or (estimate.poses[:, 3] != [0, 0, 0, 1]).any()
-    ):
+    if off > _RIGID or (np.linalg.det(R) < 0).any() or (estimate.poses[:, 3] != [0, 0, 0, 1]).any():
         raise InferenceFailure(f"aligner {name}: poses are not rigid transforms (off by {off:.2g})")
     return InferenceAnswer(estimate, seconds)
 
@@ -175,14 +169,11 @@ class WorkerInference:
         contexts: the alignments of the demonstrations, for each waypoint.
     """
 
-    def __init__(
-        self, aligner: str, options: Mapping[str, Any], contexts: Contexts
-    ) -> None:
+    def __init__(self, aligner: str, options: Mapping[str, Any], contexts: Contexts) -> None:
         self.name = aligner
         self._options = dict(options)
         self._contexts = [
-            [(alignment.grasped, alignment.target) for alignment in context]
-            for context in contexts
+            [(alignment.grasped, alignment.target) for alignment in context] for context in contexts
         ]
         self._question = 0
         self._process: subprocess.Popen | None = None
@@ -288,4 +279,3 @@ def _end(process: subprocess.Popen, connection: Connection) -> None:
     connection.close()
     process.kill()
     process.wait()
-

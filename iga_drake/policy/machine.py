@@ -248,9 +248,7 @@ class PolicyMachine:
                 return self._enter(memory, Phase.INFER, now, waypoint.name, detail)
         return self._start_move(memory, now, detail)
 
-    def _see_gripper(
-        self, memory: PolicyMemory, inputs: PolicyInputs, now: float
-    ) -> PolicyMemory:
+    def _see_gripper(self, memory: PolicyMemory, inputs: PolicyInputs, now: float) -> PolicyMemory:
         """Adds the hand's own points to what was observed, where a waypoint relates them."""
         for plan in self.motion.observations:
             if plan.role != "gripper" or plan.name in memory.observations:

@@ -40,8 +40,6 @@ def make_station(
 
     Raises `StationError` for an unknown name, for what can't be built, and for a broken contract.
     """
-    station = _REGISTRY.factory(scenario.station)(
-        scenario, scene=scene, seed=seed, meshcat=meshcat
-    )
+    station = _REGISTRY.factory(scenario.station)(scenario, scene=scene, seed=seed, meshcat=meshcat)
     check_port_contract(station, scenario.camera_names)
     return station

@@ -2,8 +2,8 @@
 
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
-from iga_drake.station.scenario import Scenario
 from iga_drake.station.cameras.rgbd import camera_info
+from iga_drake.station.scenario import Scenario
 from iga_drake.systems.fusion import PointCloudFusion
 
 

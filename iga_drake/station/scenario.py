@@ -57,7 +57,6 @@ class Table:
     # Diffuse colour, r, g, b in [0, 1].
     color: list[float] = field(default_factory=lambda: [0.55, 0.45, 0.36])
 
-
     def check(self, where: str) -> None:
         """Raises `ConfigError` for a value out of range."""
         for name, length in (("size", 3), ("center", 2), ("color", 3)):
@@ -214,17 +213,20 @@ def scenario_path(name: str | Path) -> Path:
 
 
 def _override_text(override: str) -> str:
-    """"a.b=c" as YAML."""
+    """ "a.b=c" as YAML."""
     key, found, value = override.partition("=")
     names = key.strip().split(".")
     if not found or not all(names):
-        raise ScenarioError(f"{override}: expected key.path=value, such as control.linear_speed=0.1")
+        raise ScenarioError(
+            f"{override}: expected key.path=value, such as control.linear_speed=0.1"
+        )
     braces = "".join(f"{{{json.dumps(name)}: " for name in names)
     return f"{braces}{value}{'}' * len(names)}"
 
 
 def _layered(scenario: Scenario, text: str, where: str, *, keep_maps: bool = False) -> Scenario:
-    """`scenario` with what `text` (YAML) says on top; `keep_maps`: maps are added to, not replaced."""
+    """`scenario` with what `text` (YAML) says on top; maps are replaced, or, with `keep_maps`,
+    added to."""
     try:
         _check_keys(yaml.compose(text, Loader=yaml.SafeLoader), "")
         data = yaml_load(data=text, private=True)

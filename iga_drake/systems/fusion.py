@@ -121,7 +121,7 @@ class PointCloudFusion(LeafSystem):
     """
 
     def __init__(self, cameras: Mapping[str, CameraInfo], config: FusionConfig | None = None):
-        """`cameras`: name -> intrinsics. Raises `ConfigError`, and `FusionError` without cameras."""
+        """`cameras`: name -> intrinsics. Raises `ConfigError`, `FusionError` if there are none."""
         super().__init__()
         if not cameras:
             raise FusionError("PointCloudFusion: at least one camera is needed")
@@ -171,7 +171,11 @@ class PointCloudFusion(LeafSystem):
                 number[role] = clouds[-1].shape[1]
             counts[name] = CameraCounts(valid, number[Role.TARGET], number[Role.GRASPED])
         target, grasped = (
-            voxel_cloud(np.hstack(parts[role] or [np.zeros((3, 0), np.float32)]).T, self._config.voxel_size, self._config.min_cluster)
+            voxel_cloud(
+                np.hstack(parts[role] or [np.zeros((3, 0), np.float32)]).T,
+                self._config.voxel_size,
+                self._config.min_cluster,
+            )
             for role in (Role.TARGET, Role.GRASPED)
         )
         value.set_value(FusedClouds(target, grasped, counts))
@@ -220,7 +224,9 @@ class PointCloudFusion(LeafSystem):
         depth, label, valid = depth[part], label[part], valid[part]
         z = np.where(valid, depth, np.float32(np.nan))
         good = wanted[part] & valid
-        good &= ~unreliable_pixels(z, label, jump=self._config.depth_jump, erosion=self._config.erosion)
+        good &= ~unreliable_pixels(
+            z, label, jump=self._config.depth_jump, erosion=self._config.erosion
+        )
         # Coordinate by coordinate: contiguous arrays, several times as fast as (P, 3) ones.
         z, label = z[good], label[good]
         x, y = (ray[part][good] * z for ray in rays)

@@ -520,8 +520,7 @@ class Episode:
                 scenario=self.scenario.digest,
                 sensors=self.scenario.camera_names,
                 instances={
-                    name: f"{shape.family} {truth.instance}"
-                    for name, shape in truth.shapes.items()
+                    name: f"{shape.family} {truth.instance}" for name, shape in truth.shapes.items()
                 },
                 code=code_version(),
             ),

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
+from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
 from iga_drake.policy.motion import ObservationPlan, TaskMotion, WaypointMotion
 from iga_drake.shapes.families import pan
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.panda.model import HOME_POSITION
 from iga_drake.station.simulated.scene import Scene, SceneObject
-from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
 from iga_drake.tasks.task import (
     ROBOT,
     Snapshot,

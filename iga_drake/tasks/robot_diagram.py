@@ -121,9 +121,7 @@ def build_robot_diagram(
         output, port = source.split(".", 1)
         for sink in sinks:
             system, name = sink.split(".", 1)
-            builder.Connect(
-                systems[output].GetOutputPort(port), systems[system].GetInputPort(name)
-            )
+            builder.Connect(systems[output].GetOutputPort(port), systems[system].GetInputPort(name))
     diagram = builder.Build()
     diagram.set_name("robot")
     return RobotDiagram(diagram=diagram, station=station, fusion=fusion, policy=policy)

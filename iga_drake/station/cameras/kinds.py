@@ -1,6 +1,7 @@
 """All kinds of cameras that scenario files may name, as one type."""
 
-import typing
+import functools
+import operator
 from typing import Any, Protocol
 
 from pydrake.geometry import SceneGraph
@@ -43,4 +44,5 @@ _REGISTRY: Registry[CameraKind] = Registry(
 def camera_type() -> Any:
     """The union of all kinds' dataclasses, the plain RGB-D camera first: it needs no tag."""
     kinds = [_REGISTRY.factory(name) for name in _REGISTRY.names()]
-    return typing.Union[tuple([RgbdCamera, *(kind for kind in kinds if kind is not RgbdCamera)])]
+    others = [kind for kind in kinds if kind is not RgbdCamera]
+    return functools.reduce(operator.or_, others, RgbdCamera)

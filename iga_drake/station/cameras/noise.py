@@ -18,6 +18,7 @@ from pydrake.systems.sensors import ImageDepth32F
 
 from iga_drake.errors import check_range
 
+
 @dataclass
 class DepthNoise:
     """How a depth image gets worse than the rendered one; formulas in `noisy_depth`."""
@@ -78,7 +79,6 @@ class CalibrationError:
             self.rotation,
             f"0..(maximum - minimum) / (2 radius) = {turn:.4g} rad",
         )
-
 
 
 # A lost pixel, as RealSense cameras report it (Drake: ImageDepth32F's "too close").

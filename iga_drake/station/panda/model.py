@@ -23,10 +23,10 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context
 
+from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
 from iga_drake.errors import IgaDrakeError
 from iga_drake.paths import models_dir
 from iga_drake.station.panda.visuals import mesh_visuals
-from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
 from iga_drake.systems.ports import PANDA_JOINTS
 
 Visuals = Literal["primitives", "meshes", "auto", "none"]

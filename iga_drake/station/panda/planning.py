@@ -7,10 +7,10 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CoulombFriction
 from pydrake.planning import DofMask, RobotDiagramBuilder, SceneGraphCollisionChecker
 
-from iga_drake.planning.planning_robot import PlanningConfig, PlanningRobot
-from iga_drake.station.scenario import Table
-from iga_drake.station.panda.model import HOME_POSITION, add_panda
 from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
+from iga_drake.planning.planning_robot import PlanningConfig, PlanningRobot
+from iga_drake.station.panda.model import HOME_POSITION, add_panda
+from iga_drake.station.scenario import Table
 
 _THICKNESS = 0.4  # m, of the table in the model: nothing gets through it
 

@@ -11,23 +11,20 @@ from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import (
     Diagram,
     DiagramBuilder,
-    InputPort,
-    OutputPort,
-    PortDataType,
 )
 from pydrake.systems.primitives import MatrixGain
-from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
 
+from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
+from iga_drake.station.cameras.rgbd import add_renderer
 from iga_drake.station.contract import CHEAT, StationError
 from iga_drake.station.panda.command import PandaCommand
 from iga_drake.station.panda.model import PandaModel, Visuals, add_panda
 from iga_drake.station.scenario import Scenario, Table
-from iga_drake.station.cameras.rgbd import add_renderer
 from iga_drake.station.simulated.scene import Scene, SceneObject
-from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
-from iga_drake.systems.ports import PANDA_JOINTS, Role, station_ports
+from iga_drake.systems.ports import PANDA_JOINTS, Role
 from iga_drake.systems.segmentation import Segmentation
 from iga_drake.viewing.meshcat import add_visualizers
+
 
 def build_simulation_station(
     scenario: Scenario, *, scene: Scene | None, seed: int, meshcat: Meshcat | None = None
