@@ -6,21 +6,43 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from iga_drake.aligners.protocol import PoseEstimate
-from iga_drake.demonstrations.demonstration import Demonstration, DemonstrationSet
+from iga_drake.demonstrations.demonstration import (
+    Demonstration,
+    DemonstrationSet,
+    Observation,
+    Waypoint,
+)
+from iga_drake.policy.inference import LocalInference
 from iga_drake.policy.machine import PolicyConfig, PolicyMachine
-from iga_drake.policy.motion import TaskMotion
+from iga_drake.policy.motion import ObservationPlan, TaskMotion, WaypointMotion
 from iga_drake.systems.messages import FollowerStatus, SupervisorStatus
 
 X_PRESENT = RigidTransform(RollPitchYaw(np.pi, 0, 0), [0.4, 0.0, 0.3])
 X_GOAL = RigidTransform(RollPitchYaw(np.pi, 0, 0.4), [0.5, 0.1, 0.05])
-GRASP = TaskMotion(
-    observes_grasped=False, before_E=(0, 0, -0.1), opening_approach=0.08, opening_reached=0.0,
-    settle=1.0, after_W=(0, 0, 0.15),
+GRIP = WaypointMotion(
+    name="grip", grasped="gripper", target="pan", before_E=(0, 0, -0.1), opening_approach=0.08,
+    opening_reached=0.0, settle=1.0, after_W=(0, 0, 0.15),
 )  # fmt: skip
-STACK = TaskMotion(
-    observes_grasped=True, present=X_PRESENT, before_W=(0, 0, 0.1), opening_approach=0.0,
+PUT = WaypointMotion(
+    name="put", grasped="held", target="goal", before_W=(0, 0, 0.1), opening_approach=0.0,
     opening_reached=0.08, after_E=(0, 0, -0.1),
 )  # fmt: skip
+GRIPPER_PLAN = ObservationPlan(name="gripper", role="gripper", frame="E")
+PAN_PLAN = ObservationPlan(name="pan", role="target", frame="W")
+GOAL_PLAN = ObservationPlan(name="goal", role="target", frame="W")
+HELD_PLAN = ObservationPlan(name="held", role="grasped", frame="E", present=X_PRESENT)
+GRASP = TaskMotion(observations=(GRIPPER_PLAN, PAN_PLAN), waypoints=(GRIP,))
+STACK = TaskMotion(observations=(GOAL_PLAN, HELD_PLAN), waypoints=(PUT,))
+# The thing on the table is grasped by the gripper, shown to the cameras, and put onto the goal.
+PICK_AND_PLACE = TaskMotion(
+    observations=(
+        GRIPPER_PLAN,
+        ObservationPlan(name="pan", role="grasped", frame="W"),
+        ObservationPlan(name="held", role="grasped", frame="E", after=1, present=X_PRESENT),
+        ObservationPlan(name="goal", role="target", frame="W", after=1),
+    ),
+    waypoints=(GRIP, PUT),
+)
 RNG = np.random.default_rng(0)
 GRIPPER = RNG.normal(size=(100, 3)) * 0.03
 TARGET = RNG.normal(size=(300, 3)) * 0.05 + [0.5, 0.0, 0.05]
@@ -32,7 +54,7 @@ class FakeAligner:
 
     name: str = "fake"
     poses: tuple[RigidTransform, ...] = (X_GOAL,)
-    error: Exception | None = None
+    error: BaseException | None = None
     familiarity: float | None = None
     calls: list = field(default_factory=list)
 
@@ -51,21 +73,16 @@ class FakeAligner:
 class FakeInputs:
     """A world where every target is reached one tick after it is set."""
 
-    target: np.ndarray = field(default_factory=lambda: TARGET)
-    grasped: np.ndarray = field(default_factory=lambda: TARGET)
-    silent: tuple[str, ...] = ()
+    clouds: dict = field(default_factory=lambda: {"target": TARGET, "grasped": TARGET})
+    silent: dict = field(default_factory=dict)
     X_WE: RigidTransform = X_PRESENT
     follower_status: FollowerStatus = field(default_factory=FollowerStatus)
     supervisor_status: SupervisorStatus = field(default_factory=SupervisorStatus)
-    pulls: int = 0
+    pulled: list = field(default_factory=list)
 
-    def target_cloud(self):
-        self.pulls += 1
-        return self.target
-
-    def grasped_cloud(self):
-        self.pulls += 1
-        return self.grasped
+    def cloud(self, role):
+        self.pulled.append(role)
+        return self.clouds[role]
 
     def silent_cameras(self):
         return self.silent
@@ -83,25 +100,29 @@ class FakeInputs:
         return self.supervisor_status
 
 
-def make_demonstrations(names=("goal",)) -> DemonstrationSet:
-    count = len(names)
-    return DemonstrationSet(
-        task="grasp",
-        demonstrations=(
-            Demonstration(
-                grasped=GRIPPER, target=TARGET, X_WE=np.tile(np.eye(4), (count, 1, 1)),
-                openings=np.full(count, 0.01), names=names,
-            ),
-        ),
-    )  # fmt: skip
+def make_demonstrations(motion=GRASP, openings=(0.01, 0.06)) -> DemonstrationSet:
+    """One demonstration with the waypoints of `motion`."""
+    observations = {
+        plan.name: Observation(
+            points=GRIPPER if plan.frame == "E" else TARGET, role=plan.role, frame=plan.frame
+        )
+        for plan in motion.observations
+    }
+    waypoints = tuple(
+        Waypoint(w.name, np.eye(4), opening, grasped=w.grasped, target=w.target)
+        for w, opening in zip(motion.waypoints, openings, strict=False)
+    )
+    return DemonstrationSet("grasp", (Demonstration(observations, waypoints),))
 
 
-def make_machine(motion=GRASP, aligner=None, solve=None, demonstrations=None, **config):
+def make_machine(motion=GRASP, aligner=None, solve=None, service=None, seed=0, **config):
+    demonstrations = make_demonstrations(motion)
     return PolicyMachine(
         motion=motion,
-        aligner=aligner or FakeAligner(),
-        demonstrations=demonstrations or make_demonstrations(),
-        gripper_points=GRIPPER,
+        inference=service or LocalInference(aligner or FakeAligner(), demonstrations.contexts),
+        demonstrations=demonstrations,
+        gripper=lambda opening: GRIPPER,
         solve=solve or (lambda X_WE, near: near),
-        config=PolicyConfig(period=0.1, **config),
+        config=PolicyConfig(period=0.1, **{"observe_limit": 10.0, **config}),
+        seed=seed,
     )

@@ -6,7 +6,7 @@ from pydrake.perception import PointCloud
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from iga_drake.policy.iga_policy import IgaPolicy, to_point_cloud
+from iga_drake.policy.iga_policy import IgaPolicy
 from iga_drake.policy.motion import Phase
 from iga_drake.systems.messages import NO_TARGET, FollowerStatus
 
@@ -24,7 +24,9 @@ class CountingCloud(LeafSystem):
 
     def _calc(self, context, output) -> None:
         self.count += 1
-        output.set_value(to_point_cloud(self._points))
+        cloud = PointCloud(len(self._points))
+        cloud.mutable_xyzs()[:] = self._points.T
+        output.set_value(cloud)
 
 
 class ReachesAtOnce(LeafSystem):
@@ -61,8 +63,8 @@ def build(aligner):
 def test_runs_in_a_diagram_and_renders_only_while_observing():
     aligner = FakeAligner()
     policy, cloud, simulator, context = build(aligner)
-    assert np.isnan(policy.GetOutputPort("energy").Eval(context)[0])
-    assert policy.GetOutputPort("estimate").Eval(context) == ()
+    assert np.isnan(policy.GetOutputPort("energies").Eval(context)[0])
+    assert policy.GetOutputPort("estimates").Eval(context) == ()
     assert policy.GetOutputPort("target").Eval(context).sequence == 0
     simulator.AdvanceTo(0.4)
     assert cloud.count == 0, "the scene is still coming to rest"
@@ -71,12 +73,11 @@ def test_runs_in_a_diagram_and_renders_only_while_observing():
     assert status.phase is Phase.DONE
     assert cloud.count == 1
     assert len(aligner.calls) == 1, "inference ran once, whatever was evaluated"
-    assert policy.GetOutputPort("energy").Eval(context)[0] == 0.0
-    assert len(policy.GetOutputPort("estimate").Eval(context)[0].poses) == 1
-    observed = policy.GetOutputPort("target_observed").Eval(context).xyzs().T
-    np.testing.assert_allclose(observed, TARGET, atol=1e-6)
-    grasped = policy.GetOutputPort("grasped_observed").Eval(context).xyzs().T
-    np.testing.assert_allclose(grasped, GRIPPER, atol=1e-6)
+    assert policy.GetOutputPort("energies").Eval(context)[0] == 0.0
+    assert len(policy.GetOutputPort("estimates").Eval(context)[0].poses) == 1
+    observed = policy.GetOutputPort("observations").Eval(context)
+    np.testing.assert_allclose(observed["pan"].points, TARGET, atol=1e-6)
+    np.testing.assert_array_equal(observed["gripper"].points, GRIPPER)
     lifted = policy.GetOutputPort("target").Eval(context).X_WE
     expected = RigidTransform(X_GOAL.rotation(), X_GOAL.translation() + np.array([0, 0, 0.15]))
     assert lifted.IsNearlyEqualTo(expected, 1e-9)
@@ -85,7 +86,7 @@ def test_runs_in_a_diagram_and_renders_only_while_observing():
 def test_evaluating_outputs_never_infers():
     aligner = FakeAligner()
     policy, cloud, _simulator, context = build(aligner)
-    for name in ("target", "status", "estimate", "energy", "target_observed", "grasped_observed"):
+    for name in ("target", "status", "estimates", "energies", "observations"):
         policy.GetOutputPort(name).Eval(context)
     assert not aligner.calls and cloud.count == 0
 
@@ -96,4 +97,4 @@ def test_contexts_are_independent():
     simulator.AdvanceTo(10.0)
     port = policy.GetOutputPort("status")
     assert port.Eval(context).phase is Phase.DONE
-    assert port.Eval(policy.GetMyContextFromRoot(other)).phase is Phase.OBSERVE_TARGET
+    assert port.Eval(policy.GetMyContextFromRoot(other)).phase is Phase.OBSERVE

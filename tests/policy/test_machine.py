@@ -1,3 +1,5 @@
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -5,6 +7,8 @@ import pytest
 from policy_fakes import (
     GRASP,
     GRIPPER,
+    PICK_AND_PLACE,
+    PUT,
     RNG,
     STACK,
     TARGET,
@@ -12,14 +16,15 @@ from policy_fakes import (
     X_PRESENT,
     FakeAligner,
     FakeInputs,
-    make_demonstrations,
     make_machine,
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate
+from iga_drake.policy.inference import LocalInference
+from iga_drake.policy.machine import PolicyMachine
 from iga_drake.policy.motion import Phase, PolicyError, TaskMotion
-from iga_drake.systems.messages import FollowerStatus, SupervisorStatus
+from iga_drake.systems.messages import Cause, FollowerStatus, SupervisorStatus
 
 
 def run(machine, inputs, *, reach=True, limit=200.0):
@@ -42,12 +47,13 @@ def phases(memory):
 def test_grasp_uses_the_gripper_and_runs_to_the_end():
     aligner, inputs = FakeAligner(), FakeInputs()
     memory, targets = run(make_machine(aligner=aligner, seed=7), inputs)
-    assert phases(memory) == [Phase.OBSERVE_TARGET, Phase.INFER, Phase.EXECUTE, Phase.DONE]
+    assert phases(memory) == [Phase.OBSERVE, Phase.INFER, Phase.MOVE, Phase.DONE]
+    assert [entry.subject for entry in memory.status.timeline] == ["pan", "grip", "grip", ""]
     ((context, grasped, target, seed),) = aligner.calls
     assert len(context) == 1 and seed == 7
     np.testing.assert_array_equal(grasped, GRIPPER)
     np.testing.assert_array_equal(target, TARGET)
-    assert inputs.pulls == 1
+    assert inputs.pulled == ["target"]
     assert sorted(targets) == list(range(5))
     openings = [targets[k].opening_reached for k in range(1, 5)]
     assert openings == [0.08, 0.08, 0.01, 0.01]  # the demonstrations' opening at the waypoint
@@ -62,42 +68,78 @@ def test_grasp_uses_the_gripper_and_runs_to_the_end():
 def test_stack_presents_the_held_object_and_carries_it_into_the_hand_frame():
     aligner, inputs = FakeAligner(), FakeInputs()
     points_E = RNG.normal(size=(80, 3)) * 0.05
-    inputs.grasped = (X_PRESENT @ points_E.T).T
+    inputs.clouds = {"target": TARGET, "grasped": (X_PRESENT @ points_E.T).T}
     memory, targets = run(make_machine(STACK, aligner), inputs)
     assert phases(memory) == [
-        Phase.OBSERVE_TARGET, Phase.PRESENT_GRASPED, Phase.OBSERVE_GRASPED, Phase.INFER,
-        Phase.EXECUTE, Phase.DONE,
+        Phase.OBSERVE, Phase.PRESENT, Phase.OBSERVE, Phase.INFER, Phase.MOVE, Phase.DONE
     ]  # fmt: skip
     assert targets[1].X_WE.IsExactlyEqualTo(X_PRESENT)
     np.testing.assert_allclose(aligner.calls[0][1], points_E, atol=1e-12)
-    assert inputs.pulls == 2
+    assert inputs.pulled == ["target", "grasped"]
+    held = memory.observations["held"]
+    np.testing.assert_allclose(X_PRESENT.rotation() @ held.gravity, [0, 0, -1], atol=1e-12)
+    np.testing.assert_array_equal(memory.observations["goal"].gravity, [0, 0, -1])
+    assert held.time > memory.observations["goal"].time == pytest.approx(0.5)
+
+
+def test_pick_and_place_goes_back_from_moving_to_observing():
+    aligner, inputs = FakeAligner(), FakeInputs()
+    machine = make_machine(PICK_AND_PLACE, aligner)
+    memory, targets = run(machine, inputs)
+    told = [(entry.phase, entry.subject) for entry in memory.status.timeline]
+    assert told == [
+        (Phase.OBSERVE, "pan"), (Phase.INFER, "grip"), (Phase.MOVE, "grip"),
+        (Phase.PRESENT, "held"), (Phase.OBSERVE, "held"), (Phase.OBSERVE, "goal"),
+        (Phase.INFER, "put"), (Phase.MOVE, "put"), (Phase.DONE, ""),
+    ]  # fmt: skip
+    assert inputs.pulled == ["grasped", "grasped", "target"]
+    assert len(memory.estimates) == len(memory.chosen) == 2
+    assert len(memory.status.waypoints_reached) == len(memory.status.times_reached) == 2
+    assert memory.status.times_reached[0] < memory.status.times_reached[1]
+    assert [len(call[0]) for call in aligner.calls] == [1, 1]
+    # The hand closes at the first waypoint, stays so while it shows the thing, opens at the second.
+    openings = [targets[k].opening_reached for k in sorted(targets)]
+    assert openings == [0.08, 0.08, 0.08, 0.01, 0.01, 0.01, 0.0, 0.0, 0.06, 0.06]
+
+
+def test_waypoints_whose_clouds_are_known_are_inferred_before_any_motion():
+    both = TaskMotion(
+        observations=GRASP.observations,
+        waypoints=(GRASP.waypoints[0], replace(GRASP.waypoints[0], name="again")),
+    )
+    aligner, inputs = FakeAligner(), FakeInputs()
+    memory, _ = run(make_machine(both, aligner), inputs)
+    assert phases(memory) == [
+        Phase.OBSERVE, Phase.INFER, Phase.INFER, Phase.MOVE, Phase.MOVE, Phase.DONE
+    ]  # fmt: skip
+    assert len(aligner.calls) == 2
 
 
 def test_a_better_second_look_is_taken():
-    inputs = FakeInputs(target=np.zeros((0, 3)))
+    inputs = FakeInputs(clouds={"target": np.zeros((0, 3))})
     machine = make_machine()
     memory = machine.advance(machine.start(), inputs, 0.5)
-    assert memory.status.phase is Phase.OBSERVE_TARGET
-    inputs.target = TARGET
+    assert memory.status.phase is Phase.OBSERVE
+    inputs.clouds = {"target": TARGET}
     memory = machine.advance(memory, inputs, 2.0)
-    assert memory.status.phase is Phase.OBSERVE_TARGET, "too early to look again"
+    assert memory.status.phase is Phase.OBSERVE, "too early to look again"
     assert machine.advance(memory, inputs, 2.6).status.phase is Phase.INFER
 
 
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"target": np.zeros((0, 3))}, "target cloud is empty"),
-        ({"target": np.full((400, 3), np.nan)}, "target cloud has 0 usable points"),
-        ({"target": TARGET[:20]}, "20 usable points"),
-        ({"silent": ("camera_1",)}, "camera_1 delivered no depth"),
+        ({"clouds": {"target": np.zeros((0, 3))}}, "cloud of 'pan' is empty"),
+        ({"clouds": {"target": np.full((400, 3), np.nan)}}, "'pan' has 0 usable points"),
+        ({"clouds": {"target": TARGET[:20]}}, "20 usable points"),
+        ({"silent": {"camera_1": "is off"}}, "camera_1 is off"),
     ],
 )
 def test_bad_observations_are_refused_and_the_arm_held(changes, reason):
     aligner, inputs = FakeAligner(), FakeInputs(**changes)
     memory, targets = run(make_machine(aligner=aligner), inputs)
     assert memory.status.phase is Phase.REFUSED
-    assert memory.status.cause == "perception"
+    assert memory.status.cause is Cause.PERCEPTION
     assert reason in memory.status.reason
     assert not aligner.calls
     assert list(targets) == [0], "no motion was ever asked for"
@@ -107,16 +149,16 @@ def test_some_nan_points_are_dropped():
     noisy = TARGET.copy()
     noisy[::7] = np.nan
     aligner = FakeAligner()
-    memory, _ = run(make_machine(aligner=aligner), FakeInputs(target=noisy))
+    memory, _ = run(make_machine(aligner=aligner), FakeInputs(clouds={"target": noisy}))
     assert memory.status.phase is Phase.DONE
     assert np.isfinite(aligner.calls[0][2]).all()
 
 
 def test_an_unseen_grasped_object_is_refused_at_the_present_pose():
-    inputs = FakeInputs(grasped=np.zeros((0, 3)))
+    inputs = FakeInputs(clouds={"target": TARGET, "grasped": np.zeros((0, 3))})
     memory, targets = run(make_machine(STACK), inputs)
     assert memory.status.phase is Phase.REFUSED
-    assert "observe grasped: grasped cloud is empty" in memory.status.reason
+    assert "observe held: the cloud of 'held' is empty" in memory.status.reason
     assert memory.target.X_WE.IsExactlyEqualTo(X_PRESENT)
     assert sorted(targets) == [0, 1]
 
@@ -136,17 +178,20 @@ def test_poses_that_are_not_finite_are_refused():
 
     memory, _ = run(make_machine(aligner=Broken()), FakeInputs())
     assert (memory.status.phase, memory.status.cause) == (Phase.REFUSED, "alignment")
+    assert "not finite" in memory.status.reason
 
 
 def test_objects_that_look_like_none_of_the_demonstrations_are_refused_where_asked():
-    for familiarity, least, refused in ((0.2, 0.0, False), (0.2, 0.5, True), (None, 0.5, False)):
+    for familiarity, least, refused in (
+        (0.2, 0.0, False), (0.2, 0.5, True), (None, 0.5, False), (np.nan, 0.5, True),
+    ):  # fmt: skip
         aligner = FakeAligner(familiarity=familiarity)
         machine = make_machine(aligner=aligner, minimum_familiarity=least)
         memory, targets = run(machine, FakeInputs())
         assert (memory.status.phase == Phase.REFUSED) == refused
         if refused:
             assert memory.status.cause == "alignment" and list(targets) == [0]
-            assert "familiarity 0.20, 0.5 is asked for" in memory.status.reason
+            assert f"familiarity {familiarity:.2f}, 0.5 is asked for" in memory.status.reason
 
 
 def test_unreachable_poses_are_refused():
@@ -164,7 +209,8 @@ def test_the_reachable_mode_of_lowest_energy_is_taken():
 
     memory, _ = run(make_machine(aligner=FakeAligner(poses=poses), solve=solve), FakeInputs())
     assert memory.status.phase is Phase.DONE
-    assert memory.chosen.mode == 1 and memory.chosen.energy == 1.0
+    (chosen,) = memory.chosen
+    assert chosen.mode == 1 and chosen.energy == 1.0
 
 
 def test_the_symmetry_near_the_present_posture_is_taken():
@@ -174,13 +220,14 @@ def test_the_symmetry_near_the_present_posture_is_taken():
         return np.full(7, abs(X_WE.rotation().ToRollPitchYaw().yaw_angle()))
 
     aligner = FakeAligner(poses=(RigidTransform(RollPitchYaw(0, 0, 3.0), [0.5, 0, 0.2]),))
-    motion = replace(GRASP, symmetries_E=(RigidTransform(), flip))
+    grip = replace(GRASP.waypoints[0], symmetries_E=(RigidTransform(), flip))
+    motion = replace(GRASP, waypoints=(grip,))
     memory, _ = run(make_machine(motion, aligner, solve), FakeInputs())
-    assert memory.chosen.symmetry == 1
+    assert memory.chosen[0].symmetry == 1
 
 
 def test_a_descent_that_touches_goes_on_from_where_it_stopped():
-    motion = replace(STACK, contact_force=15.0)
+    motion = replace(STACK, waypoints=(replace(PUT, contact_force=15.0),))
     machine, inputs = make_machine(motion), FakeInputs()
     stopped = RigidTransform(RollPitchYaw(np.pi, 0.02, 0.4), [0.5, 0.102, 0.07])
     memory, now, targets = machine.start(), 0.0, {}
@@ -202,15 +249,15 @@ def test_a_descent_that_touches_goes_on_from_where_it_stopped():
 
 
 def test_a_contact_force_is_positive():
-    with pytest.raises(PolicyError, match=r"contact_force: 0\.0 N found"):
-        replace(STACK, contact_force=0.0)
+    with pytest.raises(PolicyError, match=r"contact_force 0\.0 N found"):
+        replace(PUT, contact_force=0.0)
 
 
 def test_a_motion_that_never_arrives_fails_with_what_is_left_and_holds_where_it_is():
     inputs = FakeInputs(follower_status=FollowerStatus(0, 0.123, 0.1))
-    memory, _ = run(make_machine(execute_limit=5.0), inputs, reach=False)
+    memory, _ = run(make_machine(move_limit=5.0), inputs, reach=False)
     assert (memory.status.phase, memory.status.cause) == (Phase.FAILED, "time")
-    assert "before waypoint: not reached within 5 s, 12.3 cm" in memory.status.reason
+    assert "before grip: not reached within 5 s, 12.3 cm" in memory.status.reason
     assert memory.target.X_WE.IsExactlyEqualTo(inputs.X_WE)
     assert memory.target.opening_reached == 0.08
 
@@ -218,26 +265,25 @@ def test_a_motion_that_never_arrives_fails_with_what_is_left_and_holds_where_it_
 def test_a_present_pose_that_is_never_reached_fails():
     memory, _ = run(make_machine(STACK, present_limit=5.0), FakeInputs(), reach=False)
     assert memory.status.phase is Phase.FAILED
-    assert "present grasped: not reached within 5 s" in memory.status.reason
+    assert "present held: not reached within 5 s" in memory.status.reason
 
 
 @pytest.mark.parametrize(
     ("reason", "cause"),
     [
-        ("external torque of 60.0 N m at joint 2 is above 40.0 N m for 0.05 s", "contact"),
-        ("tracking error of joint 1 is 0.300 rad, outside [-0.200, 0.200]", "contact"),
-        ("measured velocity of joint 1 is 2.185 rad/s, outside [-2.175, 2.175]", "IK"),
+        ("external torque of 60.0 N m at joint 2 is above 40.0 N m for 0.05 s", Cause.CONTACT),
+        ("measured velocity of joint 1 is 2.185 rad/s, outside [-2.175, 2.175]", Cause.IK),
     ],
 )
-def test_a_holding_supervisor_ends_the_episode_with_its_reason(reason: str, cause: str):
-    inputs = FakeInputs(supervisor_status=SupervisorStatus(True, reason))
+def test_a_holding_supervisor_ends_the_episode_with_its_reason(reason: str, cause: Cause):
+    inputs = FakeInputs(supervisor_status=SupervisorStatus(True, reason, cause))
     memory, _ = run(make_machine(), inputs)
     assert (memory.status.phase, memory.status.cause) == (Phase.FAILED, cause)
     assert f"supervisor: {reason}" in memory.status.reason
 
 
 def test_slow_inference_is_refused():
-    memory, _ = run(make_machine(infer_limit=0.0), FakeInputs())
+    memory, _ = run(make_machine(infer_limit=1e-9), FakeInputs())
     assert (memory.status.phase, memory.status.cause) == (Phase.REFUSED, "time")
 
 
@@ -247,11 +293,110 @@ def test_final_phases_stay():
     assert machine.advance(memory, inputs, 1e3) is memory
 
 
-def test_more_than_one_waypoint_is_refused():
-    with pytest.raises(PolicyError, match="2 waypoints found, 1 expected"):
-        make_machine(demonstrations=make_demonstrations(("a", "b")))
+@pytest.mark.parametrize("error", [ValueError("odd"), KeyError("k"), SystemExit(3), OSError("x")])
+def test_whatever_an_aligner_raises_is_refused(error: BaseException):
+    memory, targets = run(make_machine(aligner=FakeAligner(error=error)), FakeInputs())
+    assert (memory.status.phase, memory.status.cause) == (Phase.REFUSED, Cause.ALIGNMENT)
+    assert f"aligner fake: {type(error).__name__}" in memory.status.reason
+    assert list(targets) == [0]
 
 
-def test_a_presenting_task_needs_a_present_pose():
-    with pytest.raises(PolicyError, match="present: None found"):
-        TaskMotion(observes_grasped=True, opening_approach=0.0, opening_reached=0.08)
+@pytest.mark.parametrize("answer", [None, 3, (np.eye(4),), {"poses": 1}])
+def test_whatever_an_aligner_returns_is_refused(answer):
+    class Odd(FakeAligner):
+        def align(self, *arguments, **options):
+            return answer
+
+    memory, _ = run(make_machine(aligner=Odd()), FakeInputs())
+    assert (memory.status.phase, memory.status.cause) == (Phase.REFUSED, Cause.ALIGNMENT)
+    assert f"returned {type(answer).__name__}, a PoseEstimate is expected" in memory.status.reason
+
+
+def test_poses_that_are_not_rigid_are_refused():
+    class Scaled(FakeAligner):
+        def align(self, *arguments, **options):
+            return PoseEstimate(2 * np.eye(4)[None], np.zeros(1), np.ones(1))
+
+    memory, _ = run(make_machine(aligner=Scaled()), FakeInputs())
+    assert (memory.status.phase, memory.status.cause) == (Phase.REFUSED, Cause.ALIGNMENT)
+    assert "not rigid" in memory.status.reason
+
+
+def test_the_answer_arrives_after_the_stated_delay():
+    memory, _ = run(make_machine(inference="delay", infer_delay=1.5), FakeInputs())
+    times = {entry.phase: entry.time for entry in memory.status.timeline}
+    assert times[Phase.MOVE] - times[Phase.INFER] == pytest.approx(1.5 + 0.1, abs=0.11)
+    assert memory.status.phase is Phase.DONE
+
+
+def test_concurrent_inference_lets_time_go_on_and_holds():
+    go = threading.Event()
+
+    class Waiting(FakeAligner):
+        def align(self, *arguments, **options):
+            go.wait(10.0)
+            return super().align(*arguments, **options)
+
+    aligner = Waiting()
+    inference = LocalInference(aligner, [()], beside=True)
+    machine = make_machine(service=inference)
+    machine.config.inference = "concurrent"
+    memory, inputs, now = machine.start(), FakeInputs(), 0.0
+    for _ in range(50):
+        memory = machine.advance(memory, inputs, now)
+        now += machine.config.period
+    assert memory.status.phase is Phase.INFER and memory.target.sequence == 0
+    go.set()
+    while memory.status.phase is Phase.INFER and now < 1000.0:
+        memory = machine.advance(memory, inputs, now)
+        now += machine.config.period
+        time.sleep(0.001)
+    assert memory.status.phase is Phase.MOVE and memory.target.sequence == 1
+
+
+def test_a_concurrent_inference_without_an_answer_is_given_up():
+    class Hanging(FakeAligner):
+        def align(self, *arguments, **options):
+            time.sleep(5.0)
+
+    inference = LocalInference(Hanging(), [()], beside=True)
+    machine = make_machine(service=inference, infer_limit=0.05)
+    machine.config.inference = "concurrent"
+    memory, inputs, now = machine.start(), FakeInputs(), 0.0
+    while not memory.status.phase.final and now < 1000.0:
+        memory = machine.advance(memory, inputs, now)
+        now += machine.config.period
+        time.sleep(0.001)
+    assert (memory.status.phase, memory.status.cause) == (Phase.REFUSED, Cause.TIME)
+    assert "aligner fake: no answer after 0.1 s, the limit is 0.05 s" in memory.status.reason
+
+
+def test_demonstrations_of_other_waypoints_are_refused():
+    machine = make_machine(GRASP)
+    with pytest.raises(PolicyError, match=r"'grip', 'gripper', 'pan'.*found, .*'put'"):
+        PolicyMachine(
+            motion=STACK,
+            inference=machine.inference,
+            demonstrations=machine._demonstrations,
+            gripper=lambda opening: GRIPPER,
+            solve=lambda X_WE, near: near,
+        )
+
+
+@pytest.mark.parametrize(
+    ("observations", "waypoints", "message"),
+    [
+        (STACK.observations[:1], (PUT,), "relates the grasped 'held'"),
+        (GRASP.observations, (replace(PUT, grasped="pan"),), "in frame E"),
+        (
+            (replace(STACK.observations[0], after=1), STACK.observations[1]),
+            (PUT,),
+            "after at most 0 waypoints",
+        ),
+        (STACK.observations, (), "at least one waypoint"),
+        (STACK.observations, (PUT, PUT), "every name once"),
+    ],
+)
+def test_motions_that_cannot_be_done_cannot_be_made(observations, waypoints, message: str):
+    with pytest.raises(PolicyError, match=message):
+        TaskMotion(observations=observations, waypoints=waypoints)
