@@ -1,8 +1,8 @@
 """Grasp: take a pan by its handle and lift it."""
 
-from collections.abc import Mapping, Sequence
-from functools import cache
+from collections.abc import Mapping
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
@@ -13,46 +13,38 @@ from iga_drake.shapes.families import pan
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.panda.model import HOME_POSITION
-from iga_drake.station.simulated.scene import Scene, SceneObject
-from iga_drake.tasks.task import (
-    ROBOT,
-    Snapshot,
-    Split,
-    Task,
-    Verdict,
-    last_seconds,
-    mesh_folder_or_default,
-    tilt,
+from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
+from iga_drake.tasks.placement import WorkArea
+from iga_drake.tasks.predicates import (
+    AllOf,
+    HeldStill,
+    Lifted,
+    NotTouching,
+    Predicate,
+    Touching,
+    Upright,
 )
+from iga_drake.tasks.snapshots import ROBOT, TABLE
+from iga_drake.tasks.task import Split, Task
 
 TARGET = "target"
 LIFT = 0.18  # m, what the policy lifts after closing the hand
 LIFTED = 0.10  # m, what counts
 HOLD = 1.0  # s
 SLIP = 0.01  # m
-_SEEDS: dict[Split, tuple[int, ...]] = {
-    "demonstration": (101, 102, 103, 104, 105, 106),
-    "test": (201, 202, 203, 204, 205, 206, 207, 208),
-}
-_WORK_LOWER, _WORK_UPPER = np.array([0.35, -0.3]), np.array([0.65, 0.3])
-# Distance of the handle's middle from the robot's axis that the hand reaches from above (m).
-_REACH = (0.33, 0.68)
-_CLEARANCE = 0.0003  # m between object and table at the start
+# The reach is the handle's middle's: there the hand takes it from above.
+_WORK_AREA = WorkArea(lower=(0.35, -0.3), upper=(0.65, 0.3), reach=(0.33, 0.68))
 _COLORS = ((0.18, 0.19, 0.2), (0.62, 0.16, 0.13), (0.55, 0.57, 0.6), (0.16, 0.3, 0.45))
-
-
-@cache
-def _instances(split: Split) -> tuple[Mapping[str, ShapeInstance], ...]:
-    return tuple(
-        {TARGET: pan.build(pan.sample_parameters(np.random.default_rng(seed)))}
-        for seed in _SEEDS[split]
-    )
 
 
 class Grasp(Task):
     """A pan stands anywhere in the work area, turned anyhow; the hand comes from above."""
 
     name = "grasp"
+    seeds: ClassVar[Mapping[Split, tuple[int, ...]]] = {
+        "demonstration": (101, 102, 103, 104, 105, 106),
+        "test": (201, 202, 203, 204, 205, 206, 207, 208),
+    }
     motion = TaskMotion(
         observations=(
             ObservationPlan(name="gripper", role="gripper", frame="E"),
@@ -77,38 +69,27 @@ class Grasp(Task):
     )
     observe_posture = np.array(HOME_POSITION)
 
-    def instances(self, split: Split) -> tuple[Mapping[str, ShapeInstance], ...]:
-        return _instances(split)
+    @staticmethod
+    def make_shapes(seed: int) -> Mapping[str, ShapeInstance]:
+        return {TARGET: pan.build(pan.sample_parameters(np.random.default_rng(seed)))}
 
-    def scene(
-        self,
-        seed: int,
-        split: Split = "test",
-        *,
-        instance: int | None = None,
-        mesh_folder: Path | None = None,
-    ) -> Scene:
-        index, shapes, rng = self._choose(seed, split, instance)
-        shape = shapes[TARGET]
-        sdf = write_sdf(
-            shape,
-            mesh_folder_or_default(mesh_folder),
-            name=TARGET,
-            color=_COLORS[rng.integers(len(_COLORS))],
-            friction=1.0,
-        )
+    def arrange(self, truth: SceneTruth, rng: np.random.Generator, mesh_folder: Path) -> Scene:
+        shape = truth.shapes[TARGET]
+        color = _COLORS[rng.integers(len(_COLORS))]
+        sdf = write_sdf(shape, mesh_folder, name=TARGET, color=color, friction=1.0)
+        X_WO = _WORK_AREA.draw_pose(rng, shape.frames["handle"][:3, 3])
         return Scene(
-            objects=(SceneObject(TARGET, "target", sdf, _place(shape, rng)),),
+            objects=(SceneObject(TARGET, "target", sdf, X_WO),),
             panda_position=self.observe_posture.copy(),
             hand_opening=HAND_OPENING_MAX,
-            privileged={"task": self.name, "split": split, "instance": index, "shapes": shapes},
+            truth=truth,
         )
 
     def expert(
         self, scene: Scene, X_WO: Mapping[str, RigidTransform], X_WE: RigidTransform
     ) -> tuple[RigidTransform, ...]:
         """E at the handle's middle, x along the handle, approaching against the handle's z."""
-        X_OH = RigidTransform(scene.privileged["shapes"][TARGET].frames["handle"])
+        X_OH = RigidTransform(scene.truth.shapes[TARGET].frames["handle"])
         X_HE = RigidTransform(RotationMatrix.MakeXRotation(np.pi), [0, 0, 0])
         grasp = X_WO[TARGET] @ X_OH @ X_HE
         # The hand is the same turned by half a turn: take the pose that is nearer to now.
@@ -118,42 +99,23 @@ class Grasp(Task):
         ]
         return (poses[int(np.argmax(cosines))],)
 
-    def success(self, scene: Scene, snapshots: Sequence[Snapshot]) -> Verdict:
-        """At every time of the last second: the pan's centre of mass is at least 10 cm higher than
-        at the start, the pan touches the robot and not the table, and it has moved by less than
-        1 cm in the hand since that second began.
-        """
-        window = last_seconds(self.name, snapshots, HOLD)
-        p_OCcm = scene.privileged["shapes"][TARGET].mass_properties.p_OCcm
-        start = scene.objects[0].X_WO.multiply(p_OCcm)[2]
-        lifts = [s.X_WO[TARGET].multiply(p_OCcm)[2] - start for s in window]
-        p_EC = np.array(
-            [s.X_WE.inverse().multiply(s.X_WO[TARGET].multiply(p_OCcm)) for s in window]
+    def goal(self, truth: SceneTruth) -> Predicate:
+        """For the last second the pan is lifted, off the table, and still in the hand."""
+        return AllOf(
+            predicates=(
+                Lifted(object=TARGET, height=LIFTED, for_last=HOLD),
+                NotTouching(first=TARGET, second=TABLE, for_last=HOLD),
+                Touching(
+                    first=TARGET,
+                    second=ROBOT,
+                    for_last=HOLD,
+                    otherwise="the hand doesn't hold the pan",
+                ),
+                HeldStill(object=TARGET, slip=SLIP, for_last=HOLD),
+                # Measured only: a pan may hang from its handle.
+                Upright(object=TARGET, tilt=np.pi),
+            )
         )
-        slip = float(np.linalg.norm(p_EC - p_EC[0], axis=1).max())
-        measures = {"lift": min(lifts), "slip": slip, "tilt": tilt(window[-1].X_WO[TARGET])}
-        reason = ""
-        if min(lifts) < LIFTED:
-            reason = f"the pan was lifted {min(lifts):.3f} m, {LIFTED} m are asked for"
-        elif any(s.touches(TARGET, "world") for s in window):
-            reason = "the pan touches the table"
-        elif not all(s.touches(TARGET, ROBOT) for s in window):
-            reason = "the hand doesn't hold the pan"
-        elif slip > SLIP:
-            reason = f"the pan slipped {slip:.3f} m in the hand within {HOLD} s"
-        return Verdict(not reason, reason, measures)
-
-
-def _place(shape: ShapeInstance, rng: np.random.Generator) -> RigidTransform:
-    """A pose on the table whose handle is in the arm's reach; the pan's middle in the work area."""
-    p_OH = shape.frames["handle"][:3, 3]
-    while True:
-        x, y = rng.uniform(_WORK_LOWER, _WORK_UPPER)
-        R_WO = RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi))
-        X_WO = RigidTransform(R_WO, [x, y, _CLEARANCE])
-        p_WH = X_WO.multiply(p_OH)
-        if _REACH[0] <= np.hypot(p_WH[0], p_WH[1]) <= _REACH[1] and p_WH[0] > 0.2:
-            return X_WO
 
 
 TASKS = {Grasp.name: Grasp}

@@ -1,11 +1,13 @@
 """Stack: put the bowl in the hand into the bowl on the table."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from scipy.optimize import linprog
 
@@ -14,38 +16,35 @@ from iga_drake.shapes.families import bowl
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.panda.model import HOME_POSITION, add_panda
-from iga_drake.station.simulated.scene import Scene, SceneObject
+from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
 from iga_drake.tasks.nesting import nesting_height, release_height
-from iga_drake.tasks.task import (
-    ROBOT,
-    Snapshot,
-    Split,
-    Task,
-    TaskError,
-    Verdict,
-    last_seconds,
-    mesh_folder_or_default,
-    tilt,
+from iga_drake.tasks.placement import WorkArea
+from iga_drake.tasks.predicates import (
+    AllOf,
+    AtRest,
+    Below,
+    NearAxis,
+    NotTouching,
+    Predicate,
+    Touching,
+    Upright,
 )
+from iga_drake.tasks.snapshots import ROBOT, TABLE, TaskError
+from iga_drake.tasks.task import Split, Task
 
 TARGET, HELD = "target", "grasped"
 SETTLED = 2.0  # s after the release
 TILT = np.radians(20.0)  # between the axes
+TARGET_TILT = np.radians(10.0)
 OFFSET_SHARE = 0.25  # of the target's diameter, between the axes at the held bowl's base
 DEPTH_SHARE = 0.3  # of the target's height, of the held bowl's base below the target's rim
-REST = 0.003  # m moved in the last half second
+REST, REST_TIME = 0.003, 0.5  # m moved in so many of the last seconds
 MAXIMUM_DROP = 0.02  # m from the release to nesting, by choice of the pairs
 CONTACT_FORCE = 15.0  # N; the bowl is let go where it, or a finger, meets the other one
 RELEASE_OPENING = (
     0.03  # m; more would push the outer finger, which points down, into the bowl below
 )
-_SEEDS: dict[Split, tuple[int, ...]] = {
-    "demonstration": (301, 302, 303, 304, 305, 306),
-    "test": (401, 402, 403, 404, 405, 406, 407, 408),
-}
-_WORK_LOWER, _WORK_UPPER = np.array([0.42, -0.25]), np.array([0.65, 0.25])
-_REACH = (0.48, 0.68)
-_CLEARANCE = 0.0003
+_WORK_AREA = WorkArea(lower=(0.42, -0.25), upper=(0.65, 0.25), reach=(0.48, 0.68))
 _GRIP_DEPTH = (0.004, 0.007)  # m from the rim to the middle of the pads
 _GRIP_ROLL = 0.1  # rad about the fingers' direction
 _PAD = 0.009  # m, half edge of a pad
@@ -116,11 +115,6 @@ def _pair(seed: int) -> Mapping[str, ShapeInstance]:
 
 
 @cache
-def _instances(split: Split) -> tuple[Mapping[str, ShapeInstance], ...]:
-    return tuple(_pair(seed) for seed in _SEEDS[split])
-
-
-@cache
 def _start_pose() -> RigidTransform:
     """X_WE at `Stack.observe_posture`."""
     plant = MultibodyPlant(0.0)
@@ -135,6 +129,10 @@ class Stack(Task):
     """A bowl stands anywhere in the work area; the hand holds another by its rim, by friction."""
 
     name = "stack"
+    seeds: ClassVar[Mapping[Split, tuple[int, ...]]] = {
+        "demonstration": (301, 302, 303, 304, 305, 306),
+        "test": (401, 402, 403, 404, 405, 406, 407, 408),
+    }
     # The hand turned so that the bowl hangs in front of it, towards the first camera.
     observe_posture = np.array([*HOME_POSITION[:6], -np.pi / 4])
     motion = TaskMotion(
@@ -165,20 +163,12 @@ class Stack(Task):
         ),
     )
 
-    def instances(self, split: Split) -> tuple[Mapping[str, ShapeInstance], ...]:
-        return _instances(split)
+    @staticmethod
+    def make_shapes(seed: int) -> Mapping[str, ShapeInstance]:
+        return _pair(seed)
 
-    def scene(
-        self,
-        seed: int,
-        split: Split = "test",
-        *,
-        instance: int | None = None,
-        mesh_folder: Path | None = None,
-    ) -> Scene:
-        """`Scene.privileged` also holds "X_EO", the held bowl's pose in the hand at the start."""
-        index, shapes, rng = self._choose(seed, split, instance)
-        folder = mesh_folder_or_default(mesh_folder)
+    def arrange(self, truth: SceneTruth, rng: np.random.Generator, mesh_folder: Path) -> Scene:
+        shapes = truth.shapes
         X_OE, opening = grip(
             shapes[HELD], depth=rng.uniform(*_GRIP_DEPTH), roll=rng.uniform(-_GRIP_ROLL, _GRIP_ROLL)
         )
@@ -187,23 +177,17 @@ class Stack(Task):
 
         def sdf(name: str, color: int) -> str:
             rgb = _COLORS[colors[color]]
-            return write_sdf(shapes[name], folder, name=name, color=rgb, friction=0.7)
+            return write_sdf(shapes[name], mesh_folder, name=name, color=rgb, friction=0.7)
 
         objects = (
-            SceneObject(TARGET, "target", sdf(TARGET, 0), _place(rng)),
+            SceneObject(TARGET, "target", sdf(TARGET, 0), _WORK_AREA.draw_pose(rng)),
             SceneObject(HELD, "grasped", sdf(HELD, 1), _start_pose() @ X_EO),
         )
         return Scene(
             objects=objects,
             panda_position=self.observe_posture.copy(),
             hand_opening=opening + 0.0002,
-            privileged={
-                "task": self.name,
-                "split": split,
-                "instance": index,
-                "shapes": shapes,
-                "X_EO": X_EO,
-            },
+            truth=replace(truth, X_EO={HELD: X_EO}),
         )
 
     def expert(
@@ -211,7 +195,7 @@ class Stack(Task):
     ) -> tuple[RigidTransform, ...]:
         """The held bowl upright above the target on its axis, as low as the hand may go, turned so
         that the hand is between it and the robot's base."""
-        shapes = scene.privileged["shapes"]
+        shapes = scene.truth.shapes
         X_AE = X_WO[HELD].inverse() @ X_WE
         held, target = (bowl.profile(shapes[name].parameters) for name in (HELD, TARGET))
         height = release_height(held, target, X_AE, (0.005, RELEASE_OPENING))
@@ -223,57 +207,52 @@ class Stack(Task):
         )
         return (X_WA @ X_AE,)
 
-    def success(self, scene: Scene, snapshots: Sequence[Snapshot]) -> Verdict:
-        """At the end, having been free of the robot for the last 2 s:
-
-        - the angle between the bowls' axes is at most 20 deg, the target's tilt at most 10 deg;
-        - the held bowl's base is, in the target's frame, at most 25 % of the target's diameter off
-          its axis and at least 30 % of its height below its rim;
-        - the held bowl touches the target and not the table;
-        - in the last half second it moved by at most 3 mm.
-        """
-        window = last_seconds(self.name, snapshots, SETTLED)
-        target = scene.privileged["shapes"][TARGET]
+    def goal(self, truth: SceneTruth) -> Predicate:
+        """The bowl has been free of the robot for 2 s and lies at the end in the other one:
+        upright, near its axis, below its rim, at rest."""
+        target = truth.shapes[TARGET]
         rim = target.frames["opening"][2, 3]
-        diameter = target.parameters["diameter"]
-        last = window[-1]
-        X_TA = last.X_WO[TARGET].inverse() @ last.X_WO[HELD]
-        late = [s for s in window if s.time >= last.time - 0.5]
-        p_late = np.array([s.X_WO[HELD].translation() for s in late])
-        measures = {
-            "tilt": tilt(X_TA),
-            "target_tilt": tilt(last.X_WO[TARGET]),
-            "offset": float(np.hypot(*X_TA.translation()[:2])),
-            "depth": float(rim - X_TA.translation()[2]),
-            "motion": float(np.linalg.norm(p_late - p_late[-1], axis=1).max()),
-        }
-        reason = ""
-        if any(s.touches(HELD, ROBOT) for s in window):
-            reason = f"the hand touched the bowl within the last {SETTLED} s"
-        elif last.touches(HELD, "world"):
-            reason = "the bowl touches the table"
-        elif measures["target_tilt"] > np.radians(10.0):
-            reason = f"the lower bowl is tilted {np.degrees(measures['target_tilt']):.0f} deg"
-        elif not last.touches(HELD, TARGET):
-            reason = "the bowl doesn't rest on the other"
-        elif measures["tilt"] > TILT:
-            reason = f"the bowl's axis is tilted {np.degrees(measures['tilt']):.0f} deg, at most 20"
-        elif measures["offset"] > OFFSET_SHARE * diameter:
-            reason = f"the bowl is {measures['offset']:.3f} m off the other's axis"
-        elif measures["depth"] < DEPTH_SHARE * rim:
-            reason = f"the bowl's base is only {measures['depth']:.3f} m below the other's rim"
-        elif measures["motion"] > REST:
-            reason = f"the bowl still moves ({measures['motion']:.3f} m in 0.5 s)"
-        return Verdict(not reason, reason, measures)
-
-
-def _place(rng: np.random.Generator) -> RigidTransform:
-    """An upright pose on the table within reach, turned anyhow."""
-    while True:
-        x, y = rng.uniform(_WORK_LOWER, _WORK_UPPER)
-        if _REACH[0] <= np.hypot(x, y) <= _REACH[1]:
-            yaw = rng.uniform(-np.pi, np.pi)
-            return RigidTransform(RollPitchYaw(0, 0, yaw), [x, y, _CLEARANCE])
+        return AllOf(
+            predicates=(
+                NotTouching(
+                    first=HELD,
+                    second=ROBOT,
+                    for_last=SETTLED,
+                    otherwise="the hand touched the bowl",
+                ),
+                NotTouching(first=HELD, second=TABLE, otherwise="the bowl touches the table"),
+                Upright(
+                    object=TARGET,
+                    tilt=TARGET_TILT,
+                    name="target",
+                    otherwise="the lower bowl is tilted",
+                ),
+                Touching(first=HELD, second=TARGET, otherwise="the bowl doesn't rest on the other"),
+                Upright(
+                    object=HELD, other=TARGET, tilt=TILT, otherwise="the bowl's axis is tilted"
+                ),
+                NearAxis(
+                    object=HELD,
+                    point="base",
+                    other=TARGET,
+                    offset=OFFSET_SHARE * target.parameters["diameter"],
+                    otherwise="the bowl is off the other's axis",
+                ),
+                Below(
+                    object=HELD,
+                    point="base",
+                    other=TARGET,
+                    depth=DEPTH_SHARE * rim,
+                    otherwise="the bowl's base is not far enough below the other's rim",
+                ),
+                AtRest(
+                    object=HELD,
+                    motion=REST,
+                    for_last=REST_TIME,
+                    otherwise="the bowl still moves",
+                ),
+            )
+        )
 
 
 TASKS = {Stack.name: Stack}

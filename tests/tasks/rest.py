@@ -1,5 +1,6 @@
 """Scenes in a plant, for tests: what touches what, and where things come to rest."""
 
+import numpy as np
 from pydrake.geometry import Box
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
@@ -19,7 +20,10 @@ from iga_drake.station.simulated.scene import Scene
 
 
 class Rest:
-    """The scene's objects on the table with the Panda holding its first posture."""
+    """The scene's objects on the table with the Panda holding its first posture.
+
+    The hand closes on what it holds at the start, else it keeps its opening.
+    """
 
     def __init__(self, scene: Scene) -> None:
         builder = DiagramBuilder()
@@ -44,7 +48,7 @@ class Rest:
             self.plant.SetDefaultFloatingBaseBodyPose(body, item.X_WO)
         self.plant.Finalize()
         command = builder.AddSystem(PandaCommand(time_step=0.002))
-        opening = scene.hand_opening if scene.hand_command is None else scene.hand_command
+        opening = 0.0 if scene.truth.X_EO else scene.hand_opening
         for port, value in (("panda.position", scene.panda_position), ("hand.opening", [opening])):
             source = builder.AddSystem(ConstantVectorSource(value))
             builder.Connect(source.get_output_port(), command.GetInputPort(port))
@@ -68,3 +72,8 @@ class Rest:
         """Deepest overlap (m) of any two geometries."""
         query = self.plant.get_geometry_query_input_port().Eval(self.context)
         return max((pair.depth for pair in query.ComputePointPairPenetration()), default=0.0)
+
+
+def tilt(X_WO: RigidTransform) -> float:
+    """Angle (rad) between the object's z axis and the vertical."""
+    return float(np.arccos(np.clip(X_WO.rotation().matrix()[2, 2], -1.0, 1.0)))

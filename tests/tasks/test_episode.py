@@ -20,7 +20,7 @@ from iga_drake.tasks.episode import (
     run_episode,
     to_demonstration,
 )
-from iga_drake.tasks.task import TaskError
+from iga_drake.tasks.snapshots import TaskError
 
 
 @dataclass

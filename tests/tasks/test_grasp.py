@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from iga_drake.station.panda.model import gripper_cloud
 from iga_drake.station.simulated.scene import Scene
 from iga_drake.tasks.grasp import Grasp
-from iga_drake.tasks.task import ROBOT, TABLE, Snapshot
+from iga_drake.tasks.snapshots import ROBOT, TABLE, Snapshot
 
 HELD = frozenset({frozenset(("target", ROBOT))})
 TIMES = np.arange(0.0, 2.01, 0.05)
@@ -76,7 +76,7 @@ def test_the_expert_s_hand_straddles_the_handle(split, instance: int, tmp_path: 
     X_WO = {"target": scene.objects[0].X_WO}
     above = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), [0.4, 0.0, 0.5])
     (X_WE,) = task.expert(scene, X_WO, above)
-    shape = scene.privileged["shapes"]["target"]
+    shape = scene.truth.shapes["target"]
     X_EO = X_WE.inverse() @ X_WO["target"]
     handle = shape.vertices[np.unique(shape.faces[shape.part_labels == 5])]
     p_E = X_EO.multiply(handle.T).T

@@ -45,7 +45,7 @@ def test_a_bowl_too_large_sits_on_the_rim() -> None:
 @pytest.mark.parametrize("instance", [0, 3])
 def test_a_dropped_bowl_comes_to_rest_at_nesting_height(instance: int, tmp_path: Path) -> None:
     scene = Stack().scene(0, "demonstration", instance=instance, mesh_folder=tmp_path)
-    shapes = scene.privileged["shapes"]
+    shapes = scene.truth.shapes
     height = nesting_height(*(bowl.profile(shapes[name].parameters) for name in (HELD, TARGET)))
     target, held = scene.objects
     dropped = RigidTransform(target.X_WO.translation() + np.array([0.0, 0.0, height + 0.004]))
@@ -53,7 +53,6 @@ def test_a_dropped_bowl_comes_to_rest_at_nesting_height(instance: int, tmp_path:
         replace(
             scene,
             objects=(target, replace(held, X_WO=dropped)),
-            hand_command=None,
             hand_opening=0.08,
         )
     )

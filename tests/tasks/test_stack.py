@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
-from rest import Rest
+from rest import Rest, tilt
 
 from iga_drake.shapes.families import bowl
 from iga_drake.station.simulated.scene import Scene
 from iga_drake.tasks.nesting import nesting_height
+from iga_drake.tasks.snapshots import ROBOT, TABLE, Snapshot, read_snapshot
 from iga_drake.tasks.stack import HELD, TARGET, Stack, grip
-from iga_drake.tasks.task import ROBOT, TABLE, Snapshot, read_snapshot, tilt
 
 NESTED = frozenset({frozenset((HELD, TARGET)), frozenset((TARGET, TABLE))})
 TIMES = np.arange(0.0, 3.01, 0.05)
@@ -31,7 +31,7 @@ def _trajectory(
     contacts: Callable[[float], frozenset] = lambda t: NESTED,
 ) -> list[Snapshot]:
     """`X_TA`: the held bowl's pose relative to where it nests in the target."""
-    shapes = scene.privileged["shapes"]
+    shapes = scene.truth.shapes
     height = nesting_height(*(bowl.profile(shapes[name].parameters) for name in (HELD, TARGET)))
     X_WT = scene.objects[0].X_WO @ RigidTransform(RollPitchYaw(target_roll, 0, 0), [0, 0, 0])
     return [
@@ -82,16 +82,14 @@ def test_the_expert_puts_the_bowl_upright_over_the_other(seed: int, tmp_path: Pa
     task = Stack()
     scene = task.scene(seed, "demonstration", mesh_folder=tmp_path)
     X_WO = {item.name: item.X_WO for item in scene.objects}
-    X_EO = scene.privileged["X_EO"]
+    X_EO = scene.truth.X_EO[HELD]
     start = X_WO[HELD] @ X_EO.inverse()
     (X_WE,) = task.expert(scene, X_WO, start)
     placed = X_WE @ X_EO
     over = placed.translation() - X_WO[TARGET].translation()
     np.testing.assert_allclose(over[:2], 0.0, atol=1e-9)
     assert tilt(placed) < 1e-6
-    profiles = [
-        bowl.profile(scene.privileged["shapes"][name].parameters) for name in (HELD, TARGET)
-    ]
+    profiles = [bowl.profile(scene.truth.shapes[name].parameters) for name in (HELD, TARGET)]
     assert 0.003 < over[2] - nesting_height(*profiles) < 0.025
     # The hand stands between the bowl and the robot's base, and reaches down.
     assert np.linalg.norm(X_WE.translation()[:2]) < np.linalg.norm(placed.translation()[:2])

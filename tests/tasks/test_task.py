@@ -1,32 +1,20 @@
-"""What tasks share: splits, scenes, the window of snapshots, reading a plant's state."""
+"""What tasks share: splits, scenes, reading a plant's state."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform, RollPitchYaw
-from rest import Rest
+from pydrake.math import RollPitchYaw
+from rest import Rest, tilt
 
 from iga_drake.tasks.registry import make_task, task_names
-from iga_drake.tasks.task import (
-    ROBOT,
-    TABLE,
-    Snapshot,
-    Task,
-    TaskError,
-    last_seconds,
-    read_snapshot,
-    tilt,
-)
+from iga_drake.tasks.snapshots import ROBOT, TABLE, TaskError, read_snapshot
+from iga_drake.tasks.task import Task
 
 
 @pytest.fixture(params=task_names())
 def task(request: pytest.FixtureRequest) -> Task:
     return make_task(request.param)
-
-
-def _at(*times: float) -> list[Snapshot]:
-    return [Snapshot(time, {}, RigidTransform(), 0.0) for time in times]
 
 
 def test_splits_are_disjoint_and_fixed(task: Task) -> None:
@@ -47,7 +35,7 @@ def test_scenes_rest_on_the_table_without_penetration(
     task: Task, seed: int, tmp_path: Path
 ) -> None:
     scene = task.scene(seed, mesh_folder=tmp_path)
-    shapes = scene.privileged["shapes"]
+    shapes = scene.truth.shapes
     target = next(item for item in scene.objects if item.role == "target")
     vertices = target.X_WO.multiply(shapes[target.name].vertices.T)
     assert 0.0 <= vertices[2].min() < 1e-3
@@ -88,15 +76,3 @@ def test_unknown_names_are_refused_with_the_known_ones(task: Task) -> None:
         task.scene(0, "training")
     with pytest.raises(TaskError, match="there are 8"):
         task.scene(0, instance=99)
-
-
-def test_last_seconds_takes_the_end_and_refuses_gaps() -> None:
-    times = np.arange(0.0, 3.01, 0.05)
-    window = last_seconds("x", _at(*times), 1.0)
-    assert window[0].time == pytest.approx(2.0) and window[-1].time == pytest.approx(3.0)
-    with pytest.raises(TaskError, match="record longer"):
-        last_seconds("x", _at(0.0, 0.1), 1.0)
-    with pytest.raises(TaskError, match="between two snapshots"):
-        last_seconds("x", _at(0.0, 0.5, 1.5), 1.0)
-    with pytest.raises(TaskError, match="fall"):
-        last_seconds("x", _at(0.0, 2.0, 1.0), 1.0)

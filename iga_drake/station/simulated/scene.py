@@ -1,10 +1,15 @@
 """What lies on the table and how the robot starts: made by a task, built by a station."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from pydrake.math import RigidTransform
+
+from iga_drake.shapes.instance import ShapeInstance
+
+ObjectRole = Literal["target", "grasped", "other"]
 
 
 @dataclass(frozen=True)
@@ -14,11 +19,28 @@ class SceneObject:
     # Name of the model instance in the plant.
     name: str
     # Which cloud it belongs to. "other" objects are background to the cameras' labels.
-    role: Literal["target", "grasped", "other"]
+    role: ObjectRole
     # SDF text of one model with one link; mesh URIs in it are absolute file URIs.
     sdf: str
     # Initial pose in the world (= robot base) frame.
     X_WO: RigidTransform
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneTruth:
+    """What a task knows about a scene beyond what the cameras see.
+
+    Experts and success predicates read it; nothing of it reaches the policy.
+    """
+
+    # Name of the task, and which of its objects these are; empty and 0 for a scene of no task.
+    task: str = ""
+    split: str = ""
+    instance: int = 0
+    # Shapes of the scene's objects by name.
+    shapes: Mapping[str, ShapeInstance] = field(default_factory=dict)
+    # Poses in the end effector of the objects that the hand holds at the start, by name.
+    X_EO: Mapping[str, RigidTransform] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -30,5 +52,8 @@ class Scene:
     panda_position: np.ndarray
     # Opening of the hand at the start (m).
     hand_opening: float
-    # Anything a success predicate or an expert needs (privileged: never seen by the policy).
-    privileged: dict = field(default_factory=dict)
+    truth: SceneTruth = field(default_factory=SceneTruth)
+
+    def with_role(self, role: ObjectRole) -> tuple[SceneObject, ...]:
+        """The objects of a role, in their order."""
+        return tuple(item for item in self.objects if item.role == role)
