@@ -7,12 +7,13 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from iga_drake.planning.inverse_kinematics import PoseSolver
 from iga_drake.station.panda.planning import make_panda_planning_robot
+from iga_drake.station.scenario import Table
 
 
 @functools.cache
 def panda_robot():
     """The planning robot; building it takes a moment."""
-    return make_panda_planning_robot()
+    return make_panda_planning_robot(Table())
 
 
 @functools.cache

@@ -108,11 +108,13 @@ def _write_one(path: Path, demonstration: Demonstration) -> dict[str, Any]:
         "waypoints.opening": np.array([w.opening for w in demonstration.waypoints]),
     }
     for name, observation in demonstration.observations.items():
-        # Clouds are as fine as the cameras: single precision. Poses stay in double.
+        # Clouds are as fine as the cameras, and the dense trajectory is there to be looked at:
+        # single precision. The waypoints' poses stay in double.
         arrays[f"observations.{name}"] = observation.points.astype(np.float32)
     if demonstration.trajectory is not None:
         for field in dataclasses.fields(Trajectory):
-            arrays[f"trajectory.{field.name}"] = getattr(demonstration.trajectory, field.name)
+            dense = getattr(demonstration.trajectory, field.name)
+            arrays[f"trajectory.{field.name}"] = dense.astype(np.float32)
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     data = save_arrays(arrays)
     path.write_bytes(data)

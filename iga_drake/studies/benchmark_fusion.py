@@ -18,11 +18,11 @@ from pydrake.perception import Concatenate, DepthImageToPointCloud
 from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I
 
 from iga_drake.errors import IgaDrakeError
+from iga_drake.station.cameras.rgbd import camera_info
+from iga_drake.station.make import make_station
 from iga_drake.station.panda.model import HOME_POSITION
 from iga_drake.station.scenario import Scenario
-from iga_drake.station.simulated.cameras import camera_info
 from iga_drake.station.simulated.scene import Scene, SceneObject
-from iga_drake.station.simulated.station import build_simulation_station
 from iga_drake.systems.fusion import PointCloudFusion
 from iga_drake.systems.ports import Role
 
@@ -44,7 +44,7 @@ def render_images(scenario: Scenario, seed: int = 0) -> Images:
         panda_position=np.array(HOME_POSITION),
         hand_opening=0.04,
     )
-    station = build_simulation_station(scenario, scene, seed=seed)
+    station = make_station(scenario, scene=scene, seed=seed)
     context = station.CreateDefaultContext()
     images = {}
     for name in scenario.camera_names:
@@ -120,16 +120,8 @@ def table(result: dict) -> str:
 
 def _ours(scenario: Scenario, images: Images) -> Callable[[], int]:
     """Our system, told that its inputs have changed; returns the number of points."""
-    config = scenario.fusion
-    fusion = PointCloudFusion(
-        {name: camera_info(scenario.cameras[name].intrinsics) for name in images},
-        voxel_size=config.voxel_size,
-        crop_lower=config.crop_lower,
-        crop_upper=config.crop_upper,
-        erosion=config.erosion,
-        depth_jump=config.depth_jump,
-        min_cluster=config.min_cluster,
-    )
+    infos = {name: camera_info(scenario.cameras[name].intrinsics) for name in images}
+    fusion = PointCloudFusion(infos, scenario.fusion)
     context = fusion.CreateDefaultContext()
     values = []
     for name, (depth, label, X_WC) in images.items():

@@ -2,6 +2,7 @@
 
 import argparse
 import json as json_format
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -11,17 +12,21 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus
+from pydrake.systems.primitives import ConstantVectorSource
 
 from iga_drake.errors import IgaDrakeError
 from iga_drake.planning.inverse_kinematics import PoseSolver
-from iga_drake.planning.planning_robot import PlanningRobot
+from iga_drake.planning.planning_robot import PlanningConfig, PlanningRobot
 from iga_drake.station.panda.planning import make_panda_planning_robot
+from iga_drake.station.scenario import Scenario
 from iga_drake.systems.differential_ik import DifferentialIk
 from iga_drake.systems.forward_kinematics import ForwardKinematics
 from iga_drake.systems.messages import NO_TARGET, EndEffectorTarget
-from iga_drake.systems.waypoint_follower import WaypointFollower
+from iga_drake.systems.waypoint_follower import WaypointFollower, WaypointFollowerConfig
 
 _TIME_LIMIT = 20.0  # simulated s for one pose
+# Quicker than the scenario's: limits are more likely to be met.
+_CONTROL = WaypointFollowerConfig(period=0.005, linear_speed=0.25, angular_speed=math.radians(90))
 
 
 @dataclass(frozen=True)
@@ -125,13 +130,20 @@ def benchmark_ik(count: int = 1000, seed: int = 0, json: bool = False) -> IkBenc
     """
     if count < 1:
         raise IgaDrakeError(f"count {count}: at least one pose is needed")
-    robot = make_panda_planning_robot()
+    scenario = Scenario()
+    robot = make_panda_planning_robot(scenario.table, scenario.planning)
     # The watch measures distances to the table where it really is.
-    truth = make_panda_planning_robot(safety_distance=0.0, table_distance=0.0)
+    truth = make_panda_planning_robot(
+        scenario.table, PlanningConfig(safety_distance=0.0, table_distance=0.0)
+    )
     solver = PoseSolver(robot)
     builder = DiagramBuilder()
-    follower = builder.AddSystem(WaypointFollower(home=robot.home, solver=solver))
-    controller = builder.AddSystem(DifferentialIk(robot))
+    follower = builder.AddSystem(WaypointFollower(solver=solver, config=_CONTROL))
+    controller = builder.AddSystem(
+        DifferentialIk(robot, scenario.differential_ik, period=_CONTROL.period)
+    )
+    start_posture = builder.AddSystem(ConstantVectorSource(robot.home))
+    builder.Connect(start_posture.get_output_port(), controller.GetInputPort("position_measured"))
     kinematics = builder.AddSystem(ForwardKinematics(robot))
     for name in ("desired_pose", "nominal_posture"):
         builder.Connect(follower.GetOutputPort(name), controller.GetInputPort(name))
@@ -144,8 +156,7 @@ def benchmark_ik(count: int = 1000, seed: int = 0, json: bool = False) -> IkBenc
 
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
-    controller.set_initial_position(context, robot.home)
-    watch = _Watch(truth, controller, position, 0.005)
+    watch = _Watch(truth, controller, position, _CONTROL.period)
     target_port, status_port = diagram.GetInputPort("target"), follower.GetOutputPort("status")
     target_port.FixValue(context, Value[object](NO_TARGET))
     simulator.set_monitor(watch)

@@ -5,10 +5,8 @@ import yaml
 from pydrake.multibody.plant import MultibodyPlantConfig
 
 from iga_drake.paths import diagrams_dir
+from iga_drake.station.cameras.rgbd import LookAt, Pose, RgbdCamera
 from iga_drake.station.scenario import (
-    Camera,
-    LookAt,
-    Pose,
     Scenario,
     ScenarioError,
     load_scenario,
@@ -109,7 +107,7 @@ def test_what_is_stated_is_taken_and_the_rest_stays(tmp_path):
     assert scenario.camera_names == ("left",)
     assert not scenario.cameras["left"].noise.gaussian
     assert scenario.cameras["left"].noise.dropouts
-    assert scenario.cameras["left"].intrinsics == Camera().intrinsics
+    assert scenario.cameras["left"].intrinsics == RgbdCamera().intrinsics
 
 
 @pytest.mark.parametrize(
@@ -170,8 +168,17 @@ def test_wrong_type_names_the_key(tmp_path, text, where):
         ("cameras: {a: {calibration: {rotation: 1}}}", "calibration.rotation"),
         ("fusion: {crop_lower: [9, 9, 9]}", "fusion.crop_lower"),
         ("fusion: {erosion: -1}", "fusion.erosion"),
-        ("control: {joint_speed_scale: 1.5}", "control.joint_speed_scale"),
-        ("time_limits: {infer: 0}", "time_limits.infer"),
+        ("differential_ik: {velocity_scale: 1.5}", "differential_ik.velocity_scale"),
+        ("policy: {infer_limit: 0}", "policy.infer_limit"),
+        ("policy: {inference: telepathy}", "lockstep, delay, concurrent"),
+        ("differential_ik: {horizon: 0.005}", "at least the period of the commands, 0.01 s"),
+        ("supervisor: {torque_limit: [1, 2]}", "supervisor.torque_limit"),
+        ("supervisor: {workspace_lower: [1, 1, 1]}", "supervisor.workspace_lower"),
+        ("planning: {table_distance: -1}", "planning.table_distance"),
+        ("fusion: {maximum_age: 0}", "fusion.maximum_age"),
+        ("cameras: {a: {far: 40}}", "what the renderer can do"),
+        ("visualization: {port: 80}", "visualization.port"),
+        ("context_size: 0", "context_size"),
         ("seeds: {scene: -1}", "seeds.scene"),
     ],
 )
@@ -187,3 +194,72 @@ def test_missing_and_broken_files(tmp_path):
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ScenarioError, match=r"binary\.yaml"):
         load_scenario(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("task: {name: grasp}\ncontrol: {}\ntask: {name: stack}", r"'task' .* lines 1 and 3"),
+        ("control: {period: 0.01, period: 0.02}", r"'control\.period' is stated twice"),
+        ("cameras: {a: {}, a: {}}", r"'cameras\.a' is stated twice"),
+        ("cameras: {a: {pose: !LookAt {target: [0, 0, 0], target: [1, 0, 0]}}}", "target"),
+    ],
+)
+def test_a_key_stated_twice_is_refused(tmp_path, text, key):
+    with pytest.raises(ScenarioError, match=f"scenario.yaml: key .*{key}"):
+        _load(tmp_path, text)
+
+
+def test_later_files_and_settings_have_the_last_word(tmp_path):
+    first, second = tmp_path / "a.yaml", tmp_path / "b.yaml"
+    first.write_text("control: {linear_speed: 0.1, angular_speed: 0.5}\ncameras: {a: {}, b: {}}")
+    second.write_text("control: {linear_speed: 0.3}\ncameras: {c: {near: 0.4}}")
+    scenario = load_scenario(first, second)
+    assert (scenario.control.linear_speed, scenario.control.angular_speed) == (0.3, 0.5)
+    assert scenario.camera_names == ("c",)
+    changed = load_scenario(
+        first,
+        second,
+        overrides=["control.linear_speed=0.2", "cameras.c.far=2.5", "task.name=stack",
+                   "fusion.crop_lower=[0, -1, 0]"],
+    )  # fmt: skip
+    assert changed.control.linear_speed == 0.2
+    assert (changed.cameras["c"].near, changed.cameras["c"].far) == (0.4, 2.5)
+    assert changed.task.name == "stack" and changed.fusion.crop_lower == [0.0, -1.0, 0.0]
+    assert scenario.control.linear_speed == 0.3, "the first result is left as it was"
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("control.linear_sped=1", "linear_sped.*valid keys: period, linear_speed"),
+        ("control.linear_speed=fast", "control.linear_speed: expected float"),
+        ("control.linear_speed=-1", "control.linear_speed: -1.0 is out of range"),
+        ("control.linear_speed", "expected key.path=value"),
+        ("=3", "expected key.path=value"),
+        ("control.=3", "expected key.path=value"),
+        ("control.period=[", "not valid YAML"),
+    ],
+)
+def test_bad_settings_are_named(override, message):
+    with pytest.raises(ScenarioError, match=message):
+        load_scenario("grasp", overrides=[override])
+
+
+def test_the_digest_is_of_what_is_said_not_of_the_file(tmp_path):
+    texts = {
+        "a": "control: {linear_speed: 0.1}", "b": "# the same\ncontrol:\n  linear_speed: 1e-1\n",
+        "c": "control: {linear_speed: 0.11}",
+    }  # fmt: skip
+    digests = {}
+    for name, text in texts.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "same.yaml").write_text(text)
+        digests[name] = load_scenario(tmp_path / name / "same.yaml").digest
+    assert digests["a"] == digests["b"] != digests["c"]
+
+
+def test_names_of_shipped_files_are_found_and_unknown_ones_listed():
+    assert load_scenario("stack").task.name == load_scenario("stack.yaml").task.name == "stack"
+    with pytest.raises(ScenarioError, match="no such file; name a YAML file or one of: grasp"):
+        load_scenario("sweep_the_floor")

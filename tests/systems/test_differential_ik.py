@@ -4,8 +4,10 @@ from control_fixtures import downward, panda_robot
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from iga_drake.errors import IgaDrakeError
+from iga_drake.errors import ConfigError
+from iga_drake.planning.planning_robot import PlanningConfig
 from iga_drake.station.panda.planning import make_panda_planning_robot
+from iga_drake.station.scenario import Table
 from iga_drake.systems.differential_ik import DifferentialIk, DifferentialIkConfig
 
 
@@ -14,10 +16,10 @@ class Run:
 
     def __init__(self, config=None):
         self.robot = panda_robot()
-        self.system = DifferentialIk(self.robot, config)
+        self.system = DifferentialIk(self.robot, config, period=0.005)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
-        self.system.set_initial_position(self.context, self.robot.home)
+        self.system.GetInputPort("position_measured").FixValue(self.context, self.robot.home)
         self.ask(self.robot.pose(self.robot.home), self.robot.home)
 
     def ask(self, X_WE, posture):
@@ -92,7 +94,9 @@ def test_posture_moves_in_the_null_space_only(run):
 )
 def test_limits_are_kept_whatever_is_asked(run, X_WE):
     limits = run.robot.limits
-    truth = make_panda_planning_robot(safety_distance=0.0, table_distance=0.0)
+    truth = make_panda_planning_robot(
+        Table(), PlanningConfig(safety_distance=0.0, table_distance=0.0)
+    )
     start = run.position
     run.ask(X_WE, run.robot.home)
     positions = np.vstack([start, run.step(500)])
@@ -104,10 +108,33 @@ def test_limits_are_kept_whatever_is_asked(run, X_WE):
     assert min(truth.clearance(q) for q in positions[::5]) > 0.001
 
 
-def test_bad_settings_are_refused(run):
-    with pytest.raises(IgaDrakeError, match="7 finite angles"):
-        run.system.set_initial_position(run.context, np.full(7, np.nan))
-    with pytest.raises(IgaDrakeError, match="velocity_scale"):
-        DifferentialIkConfig(velocity_scale=1.5)
-    with pytest.raises(IgaDrakeError, match="time_step"):
-        DifferentialIkConfig(time_step=0.1)
+@pytest.mark.parametrize(
+    ("changes", "period", "message"),
+    [
+        ({"velocity_scale": 1.5}, 0.005, r"DifferentialIkConfig\.velocity_scale: 1\.5"),
+        ({"horizon": 0.01}, 0.02, r"horizon: 0\.01 .*at least the period.*0\.02"),
+        ({"posture_gain": 0.0}, 0.005, "posture_gain"),
+    ],
+)
+def test_bad_settings_are_refused(changes: dict, period: float, message: str):
+    with pytest.raises(ConfigError, match=message):
+        DifferentialIk(panda_robot(), DifferentialIkConfig(**changes), period=period)
+
+
+def test_starts_from_the_measured_joints_again_with_a_new_context(run):
+    elsewhere = run.robot.home + 0.1
+    run.ask(downward(0.5, 0.1, 0.3), run.robot.home)
+    run.step(20)
+    again = run.system.CreateDefaultContext()
+    for name, value in (
+        ("desired_pose", run.robot.pose(elsewhere)),
+        ("nominal_posture", elsewhere),
+        ("position_measured", elsewhere),
+    ):
+        run.system.GetInputPort(name).FixValue(again, value)
+    position = run.system.GetOutputPort("position")
+    np.testing.assert_array_equal(position.Eval(again), elsewhere)
+    run.simulator.reset_context(again)
+    run.simulator.Initialize()
+    run.simulator.AdvanceTo(0.1)
+    np.testing.assert_allclose(position.Eval(run.simulator.get_context()), elsewhere, atol=1e-6)

@@ -12,7 +12,7 @@ HOME = panda_robot().home
 
 class Run:
     def __init__(self, **config):
-        self.system = Supervisor(panda_robot(), SupervisorConfig(**config))
+        self.system = Supervisor(panda_robot(), SupervisorConfig(**config), period=0.005)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
         self.steps = 0
@@ -133,4 +133,4 @@ def test_contact_torque_holds_only_if_it_lasts():
 
 def test_wrong_number_of_torque_limits_is_refused():
     with pytest.raises(IgaDrakeError, match="7 joints"):
-        Supervisor(panda_robot(), SupervisorConfig(torque_limit=(1.0,)))
+        Supervisor(panda_robot(), SupervisorConfig(torque_limit=[1.0]), period=0.005)

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -22,16 +23,22 @@ class Run:
 
     def __init__(self, solver=None, **config):
         self.system = WaypointFollower(
-            home=panda_robot().home,
-            initial_opening=0.06,
             solver=solver,
-            config=WaypointFollowerConfig(**config),
+            config=WaypointFollowerConfig(
+                **{
+                    "period": STEP,
+                    "linear_speed": 0.25,
+                    "angular_speed": math.radians(90),
+                    **config,
+                }
+            ),
         )
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
         self.steps = 0
         self.measure(X_START)
-        self.send(NO_TARGET)
+        self.system.GetInputPort("position_measured").FixValue(self.context, panda_robot().home)
+        self.send(replace(NO_TARGET, opening_moving=0.06))
 
     def measure(self, X_WE):
         self.system.GetInputPort("pose_measured").FixValue(self.context, X_WE)

@@ -9,7 +9,7 @@ STEP = 0.002
 
 @pytest.fixture
 def started():
-    system = PandaCommand(time_step=STEP, time_constant=0.01, opening_speed=0.1)
+    system = PandaCommand(time_step=STEP)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     system.GetInputPort("panda.position").FixValue(context, np.arange(7) / 10)

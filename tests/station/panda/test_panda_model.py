@@ -40,6 +40,7 @@ from iga_drake.station.panda.model import (
     gripper_cloud,
 )
 from iga_drake.station.panda.planning import make_panda_planning_robot
+from iga_drake.station.scenario import Table
 
 
 @pytest.fixture(scope="module")
@@ -236,7 +237,7 @@ def lift(size, mass=0.3):
         plant.world_body(), RigidTransform([0.5, 0, -0.05]), Box(1, 1, 0.1), "table", table
     )
     plant.Finalize()
-    command = builder.AddSystem(PandaCommand())
+    command = builder.AddSystem(PandaCommand(time_step=0.002))
     builder.Connect(
         command.GetOutputPort("desired_state"), plant.get_desired_state_input_port(model.instance)
     )
@@ -249,7 +250,7 @@ def lift(size, mass=0.3):
     position_port = diagram.GetInputPort("panda.position")
     opening_port = diagram.GetInputPort("hand.opening")
 
-    solver = PoseSolver(make_panda_planning_robot())
+    solver = PoseSolver(make_panda_planning_robot(Table()))
     R_WE = RotationMatrix.MakeXRotation(math.pi)
     low, high = (
         solver.solve(RigidTransform(R_WE, [0.5, 0, size[2] / 2 + z])) for z in (0.01, 0.16)

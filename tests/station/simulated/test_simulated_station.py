@@ -11,17 +11,13 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, PassThrough
 
 from iga_drake.paths import diagrams_dir
+from iga_drake.station.cameras.rgbd import true_pose
+from iga_drake.station.contract import CHEAT, StationError, check_port_contract
+from iga_drake.station.make import make_station
 from iga_drake.station.panda.model import HOME_POSITION
 from iga_drake.station.perception import add_fusion
 from iga_drake.station.scenario import Scenario, load_scenario
-from iga_drake.station.simulated.cameras import true_pose
 from iga_drake.station.simulated.scene import Scene, SceneObject
-from iga_drake.station.simulated.station import (
-    CHEAT,
-    StationError,
-    build_simulation_station,
-    check_port_contract,
-)
 from iga_drake.systems.ports import Role, station_ports
 from iga_drake.viewing.meshcat import start_meshcat
 
@@ -83,7 +79,7 @@ def _command(station, context, q=Q, opening=0.06) -> None:
 
 def test_exports_exactly_the_contract():
     scenario = _default()
-    station = build_simulation_station(scenario, _scene(), seed=0)
+    station = make_station(scenario, scene=_scene(), seed=0)
     assert station.get_name() == "station"
     inputs = [station.get_input_port(i).get_name() for i in range(station.num_input_ports())]
     outputs = [station.get_output_port(i).get_name() for i in range(station.num_output_ports())]
@@ -118,7 +114,7 @@ def test_contract_check_compares_kinds():
 
 
 def test_default_context_is_the_scene():
-    station = build_simulation_station(_quiet(), _scene(), seed=0)
+    station = make_station(_quiet(), scene=_scene(), seed=0)
     context = station.CreateDefaultContext()
     value = {
         name: station.GetOutputPort(name).Eval(context)
@@ -135,7 +131,7 @@ def test_default_context_is_the_scene():
 
 
 def test_robot_follows_and_objects_rest():
-    station = build_simulation_station(_quiet(), _scene(), seed=0)
+    station = make_station(_quiet(), scene=_scene(), seed=0)
     simulator = Simulator(station)
     context = simulator.get_mutable_context()
     q = Q + np.array([0.1, 0, 0, 0.05, 0, 0, -0.1])
@@ -156,13 +152,13 @@ def test_robot_follows_and_objects_rest():
 def test_external_torque_is_that_of_the_contact_force():
     """The hand holds a box in the air: its weight, carried by friction alone, is what is felt."""
     box = _sdf("wide", "<box><size>0.03 0.04 0.03</size></box>")
-    station = build_simulation_station(_quiet(), _scene(objects=()), seed=0)
+    station = make_station(_quiet(), scene=_scene(objects=()), seed=0)
     plant = station.GetSubsystemByName("plant")
     X_WE = plant.GetFrameByName("panda_tcp").CalcPoseInWorld(
         plant.GetMyContextFromRoot(station.CreateDefaultContext())
     )
     scene = _scene(objects=(SceneObject("held", "grasped", box, X_WE),), hand_opening=0.04)
-    station = build_simulation_station(_quiet(), scene, seed=0)
+    station = make_station(_quiet(), scene=scene, seed=0)
     simulator = Simulator(station)
     context = simulator.get_mutable_context()
     _command(station, context, Q, 0.0)
@@ -192,7 +188,7 @@ def test_external_torque_is_that_of_the_contact_force():
 def rendered():
     """Scenario, station and context at the start, with perfect cameras."""
     scenario = _quiet()
-    station = build_simulation_station(scenario, _scene(), seed=0)
+    station = make_station(scenario, scene=_scene(), seed=0)
     return scenario, station, station.CreateDefaultContext()
 
 
@@ -238,7 +234,7 @@ def test_table_depth_is_the_plane(rendered):
 def test_poses_are_true_without_calibration_error_and_off_with_it(rendered):
     scenario, station, context = rendered
     noisy = _default()
-    draws = [build_simulation_station(noisy, _scene(objects=()), seed=s) for s in (0, 0, 1)]
+    draws = [make_station(noisy, scene=_scene(objects=()), seed=s) for s in (0, 0, 1)]
     contexts = [d.CreateDefaultContext() for d in draws]
     p_W = np.array([0.5, 0.0, 0.1])
     for name in scenario.camera_names:
@@ -279,7 +275,7 @@ def test_fused_ball_lies_on_the_ball():
     """Through the whole chain: rendering, roles, fusion; with perfect and with real cameras."""
     for scenario, tolerance in ((_quiet(), 0.002), (_default(), 0.012)):
         builder = DiagramBuilder()
-        station = builder.AddSystem(build_simulation_station(scenario, _scene(), seed=5))
+        station = builder.AddSystem(make_station(scenario, scene=_scene(), seed=5))
         fusion = add_fusion(builder, station, scenario)
         context = builder.Build().CreateDefaultContext()
         fusion_context = fusion.GetMyContextFromRoot(context)
@@ -299,9 +295,7 @@ def test_one_of_everything_is_built_and_steps():
     scenario = load_scenario(diagrams_dir() / "one_of_everything.yaml")
     meshcat = start_meshcat(scenario.visualization)
     builder = DiagramBuilder()
-    station = builder.AddSystem(
-        build_simulation_station(scenario, _scene(), seed=0, meshcat=meshcat)
-    )
+    station = builder.AddSystem(make_station(scenario, scene=_scene(), seed=0, meshcat=meshcat))
     fusion = add_fusion(builder, station, scenario)
     diagram = builder.Build()
     simulator = Simulator(diagram)
@@ -332,4 +326,4 @@ def test_one_of_everything_is_built_and_steps():
 )
 def test_bad_scenes_are_refused(changes, message):
     with pytest.raises(StationError, match=message):
-        build_simulation_station(_default(), _scene(**changes), seed=0)
+        make_station(_default(), scene=_scene(**changes), seed=0)

@@ -5,9 +5,10 @@ import pytest
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import ImageDepth32F
 
-from iga_drake.station.scenario import CalibrationError, DepthNoise
-from iga_drake.station.simulated.camera_noise import (
+from iga_drake.station.cameras.noise import (
+    CalibrationError,
     CameraNoise,
+    DepthNoise,
     calibration_error,
     depth_edges,
     noisy_depth,

@@ -11,28 +11,30 @@ from pydrake.math import RigidTransform
 from pydrake.perception import DepthImageToPointCloud
 from pydrake.systems.framework import DiagramBuilder
 
-from iga_drake.station.scenario import Camera, LookAt, Pose, Scenario
-from iga_drake.station.simulated.cameras import (
-    add_camera,
+from iga_drake.station.cameras.rgbd import (
+    LookAt,
+    Pose,
+    RgbdCamera,
     add_renderer,
     camera_info,
     look_at,
     true_pose,
 )
+from iga_drake.station.scenario import Scenario
 
 # Shoulder of the Panda in W, and how far the hand's tip gets from it at most (m).
 SHOULDER = np.array([0.0, 0.0, 0.333])
 REACH = 0.316 + 0.384 + 0.088 + 0.107 + 0.1034
 
 
-def _pixel(camera: Camera, p_W: np.ndarray) -> np.ndarray:
+def _pixel(camera: RgbdCamera, p_W: np.ndarray) -> np.ndarray:
     k = camera.intrinsics
     x, y, z = true_pose(camera).inverse().multiply(p_W)
     assert z > 0
     return np.array([k.fx * x / z + k.cx, k.fy * y / z + k.cy])
 
 
-def _sees(camera: Camera, p_W: np.ndarray, margin: float) -> bool:
+def _sees(camera: RgbdCamera, p_W: np.ndarray, margin: float) -> bool:
     k = camera.intrinsics
     pixel = _pixel(camera, p_W)
     return bool((pixel > margin).all() and (pixel < [k.width - margin, k.height - margin]).all())
@@ -51,12 +53,12 @@ def test_look_at(position):
 
 
 def test_pose_given_outright():
-    X_WC = true_pose(Camera(pose=Pose(translation=[0.5, 0, 1.4], rpy=[np.pi, 0, 0])))
+    X_WC = true_pose(RgbdCamera(pose=Pose(translation=[0.5, 0, 1.4], rpy=[np.pi, 0, 0])))
     np.testing.assert_allclose(X_WC.multiply([0, 0, 1.4]), [0.5, 0, 0], atol=1e-12)
 
 
 def test_default_intrinsics_are_those_of_a_d415():
-    info = camera_info(Camera().intrinsics)
+    info = camera_info(RgbdCamera().intrinsics)
     assert (info.width(), info.height()) == (640, 480)
     # The data sheet's colour field of view, 69.4 x 42.5 deg +- 3 deg at 16:9; 4:3 cuts the sides.
     assert np.degrees(info.fov_y()) == pytest.approx(42.5, abs=1.0)
@@ -88,7 +90,7 @@ def test_default_cameras_see_the_work_area_from_above_and_out_of_reach():
 def test_a_rendered_image_back_projects_to_where_things_are():
     """A ball's visible cap, seen straight on, is centred on the line of sight; Drake's own
     back-projection says where its points lie."""
-    camera = Camera(pose=Pose(translation=[0.0, 0.0, 0.0], rpy=[0.0, 0.0, 0.0]))
+    camera = RgbdCamera(pose=Pose(translation=[0.0, 0.0, 0.0], rpy=[0.0, 0.0, 0.0]))
     camera.noise.enabled = False
     builder = DiagramBuilder()
     scene_graph = builder.AddSystem(SceneGraph())
@@ -98,7 +100,7 @@ def test_a_rendered_image_back_projects_to_where_things_are():
     properties.AddProperty("label", "id", RenderLabel(1))
     ball.set_perception_properties(properties)
     scene_graph.RegisterAnchoredGeometry(scene_graph.RegisterSource("ball"), ball)
-    ports = add_camera(builder, scene_graph, name="camera", camera=camera, seed=(0,))
+    ports = camera.add(builder, scene_graph, name="camera", seed=(0,))
     project = builder.AddSystem(DepthImageToPointCloud(camera_info(camera.intrinsics)))
     builder.Connect(ports["depth_image"], project.depth_image_input_port())
     diagram = builder.Build()
