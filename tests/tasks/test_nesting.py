@@ -54,6 +54,7 @@ def test_a_dropped_bowl_comes_to_rest_at_nesting_height(instance: int, tmp_path:
             scene,
             objects=(target, replace(held, X_WO=dropped)),
             hand_opening=0.08,
+            truth=replace(scene.truth, X_EO={}),
         )
     )
     rest.simulator.AdvanceTo(0.5)
