@@ -228,8 +228,9 @@ def _layered(scenario: Scenario, text: str, where: str, *, keep_maps: bool = Fal
     """`scenario` with what `text` (YAML) says on top; maps are replaced, or, with `keep_maps`,
     added to."""
     try:
-        _check_keys(yaml.compose(text, Loader=yaml.SafeLoader), "")
-        data = yaml_load(data=text, private=True)
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        _check_keys(node, "")
+        data = None if node is None else yaml_load(data=text, private=True)
     except yaml.YAMLError as e:
         raise ScenarioError(f"{where}: not valid YAML: {e}") from e
     except ScenarioError as e:

@@ -80,16 +80,15 @@ def show_demonstrations(
     meshcat.SetCameraPose(np.array([2.3, 0.0, 1.0]), np.array([0.5, 0.0, 0.0]))
     for index, demonstration in enumerate(demonstrations.demonstrations):
         root = f"demonstrations/{index}"
-        show_cloud(meshcat, f"{root}/target cloud", demonstration.target, TARGET_COLOR)
-        for name, X in zip(demonstration.names, demonstration.X_WE, strict=True):
-            X_WE = RigidTransform(X)
-            show_triad(meshcat, f"{root}/{name}/X_WE", X_WE, length=0.06)
-            show_cloud(
-                meshcat,
-                f"{root}/{name}/grasped cloud",
-                (X_WE @ demonstration.grasped.T).T,
-                GRASPED_COLOR,
-            )
+        for k, waypoint in enumerate(demonstration.waypoints):
+            alignment = demonstration.alignment(k)
+            at = f"{root}/{waypoint.name}"
+            show_cloud(meshcat, f"{at}/{waypoint.target}", alignment.target, TARGET_COLOR)
+            show_cloud(meshcat, f"{at}/{waypoint.grasped}", alignment.grasped, GRASPED_COLOR)
+            show_triad(meshcat, f"{at}/X_WE", RigidTransform(waypoint.X_WE), length=0.06)
+        if demonstration.trajectory is not None:
+            path = demonstration.trajectory.X_WE[:, :3, 3].T
+            meshcat.SetLine(f"{root}/trajectory of E", path, 2.0, GRASPED_COLOR)
         middle = (len(demonstrations) - 1) / 2
         meshcat.SetTransform(root, RigidTransform([0.0, spacing * (index - middle), 0.0]))
 

@@ -5,9 +5,11 @@ from pydrake.perception import DepthImageToPointCloud
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I
 from scipy.spatial import KDTree
 
+from iga_drake.errors import ConfigError
 from iga_drake.geometry.voxels import voxel_cloud
 from iga_drake.systems.fusion import (
     CameraCounts,
+    FusionConfig,
     FusionError,
     PointCloudFusion,
     pixel_rays,
@@ -16,6 +18,7 @@ from iga_drake.systems.fusion import (
 
 INFO = CameraInfo(160, 120, 150.0, 155.0, 79.5, 59.5)
 SHAPE = (120, 160)
+WIDE = {"crop_lower": [-1.0, -1.0, -1.0], "crop_upper": [1.5, 1.0, 1.5]}
 # From 0.8 m above, looking straight down at the plane z = 0 of W; x right, y down in the image.
 ABOVE = RigidTransform(RollPitchYaw(np.pi, 0, 0), [0.4, 0.1, 0.8])
 
@@ -34,7 +37,7 @@ def _label(array: np.ndarray) -> ImageLabel16I:
 
 def _fuse(cameras: dict, **options):
     """Clouds of target and grasped object (P, 3), counts; `cameras`: name -> (depth, label, X)."""
-    fusion = PointCloudFusion(dict.fromkeys(cameras, INFO), **options)
+    fusion = PointCloudFusion(dict.fromkeys(cameras, INFO), FusionConfig(**(WIDE | options)))
     context = fusion.CreateDefaultContext()
     for name, (depth, label, X_WC) in cameras.items():
         fusion.GetInputPort(f"{name}.depth_image").FixValue(context, _depth(depth))
@@ -205,13 +208,37 @@ def test_outputs_follow_the_inputs():
     assert sizes[0] == sizes[2] > sizes[1] == 0
 
 
+def test_an_image_that_is_too_old_is_no_image():
+    cameras = {name: (_plane_depth(ABOVE), _square(), ABOVE) for name in ("new", "old", "never")}
+    fusion = PointCloudFusion(dict.fromkeys(cameras, INFO), FusionConfig(**WIDE, maximum_age=0.5))
+    context = fusion.CreateDefaultContext()
+    context.SetTime(10.0)
+    for name, time in (("new", 9.6), ("old", 9.4), ("never", np.nan)):
+        depth, label, X_WC = cameras[name]
+        fusion.GetInputPort(f"{name}.depth_image").FixValue(context, _depth(depth))
+        fusion.GetInputPort(f"{name}.label_image").FixValue(context, _label(label))
+        fusion.GetInputPort(f"{name}.pose").FixValue(context, X_WC)
+        fusion.GetInputPort(f"{name}.time").FixValue(context, [time])
+    counts = fusion.GetOutputPort("camera_counts")
+    target = fusion.GetOutputPort("target_cloud")
+    found = counts.Eval(context)
+    assert found["new"] == CameraCounts(valid=120 * 160, target=38 * 58, grasped=0)
+    assert (found["old"].valid, found["never"].valid) == (0, 0)
+    assert "last image 0.6 s ago, at most 0.5 s" in found["old"].problem
+    assert "no image yet" in found["never"].problem
+    size = target.Eval(context).size()
+    context.SetTime(10.2)  # nothing but time has changed
+    assert counts.Eval(context)["new"].valid == 0
+    assert target.Eval(context).size() == 0 < size
+
+
 def test_bad_settings_and_images_are_refused():
     with pytest.raises(FusionError, match="camera"):
         PointCloudFusion({})
-    with pytest.raises(FusionError, match="voxel_size"):
-        PointCloudFusion({"c": INFO}, voxel_size=0.0)
-    with pytest.raises(FusionError, match="crop"):
-        PointCloudFusion({"c": INFO}, crop_lower=[1, 1, 1], crop_upper=[0, 0, 0])
+    with pytest.raises(ConfigError, match=r"FusionConfig\.voxel_size: 0\.0"):
+        PointCloudFusion({"c": INFO}, FusionConfig(voxel_size=0.0))
+    with pytest.raises(ConfigError, match="crop"):
+        PointCloudFusion({"c": INFO}, FusionConfig(crop_lower=[1, 1, 1], crop_upper=[0, 0, 0]))
     small = np.ones((60, 80), dtype=np.float32)
     with pytest.raises(FusionError, match=r"c\.depth_image: 80 x 60 px.*160 x 120"):
         _fuse({"c": (small, _square(), ABOVE)})

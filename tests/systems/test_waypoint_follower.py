@@ -244,4 +244,4 @@ def test_bad_targets_are_refused(bad, message):
 
 def test_bad_settings_are_refused():
     with pytest.raises(IgaDrakeError, match="linear_speed"):
-        WaypointFollowerConfig(linear_speed=0.0)
+        WaypointFollower(config=WaypointFollowerConfig(linear_speed=0.0))
