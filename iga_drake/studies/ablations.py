@@ -36,11 +36,10 @@ from iga_drake.aligners.iga.local_encoder import load_encoder
 from iga_drake.aligners.iga.voting import VotingConfig
 from iga_drake.aligners.iga.weights import DESCRIPTOR, ENERGY, load_descriptor, load_energy
 from iga_drake.aligners.protocol import Aligner, PoseEstimate
-from iga_drake.checkpoint import save_checkpoint
+from iga_drake.checkpoint import file_digest, save_checkpoint
 from iga_drake.dataset.samples import SampleConfig
 from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.errors import IgaDrakeError
-from iga_drake.evaluation.alignment import digest
 from iga_drake.files import write_text
 from iga_drake.geometry.se3 import rigid
 from iga_drake.paths import models_dir
@@ -337,7 +336,7 @@ class Ablations:
         return files
 
     def _conditions(self, variant: Variant) -> dict[str, Any]:
-        files = {name: digest(path) for name, path in self._files(variant).items()}
+        files = {name: file_digest(path) for name, path in self._files(variant).items()}
         if variant.group == INFERENCE:
             return {"count": self.count} | files
         conditions: dict[str, Any] = {"count": self.count, "steps": self._steps(variant.group)}
@@ -423,7 +422,7 @@ class Ablations:
         occupancy, _ = load_encoder(self.encoder)
         weights = occupancy.encoder.state_dict(prefix="local.encoder.")
         path = folder / "start.safetensors"
-        save_checkpoint(path, weights, kind=DESCRIPTOR, card={"encoder": digest(self.encoder)})
+        save_checkpoint(path, weights, kind=DESCRIPTOR, card={"encoder": file_digest(self.encoder)})
         return path
 
     def _steps(self, group: str) -> int:

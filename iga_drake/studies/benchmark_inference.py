@@ -51,7 +51,7 @@ def _times(aligner: Aligner, count: int, demonstrations: int) -> np.ndarray:
     return np.array(seconds[1:])
 
 
-def main(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Prints median, minimum and maximum of both aligners and the ratio of the medians."""
     for name in ("count", "threads"):
         if getattr(arguments, name) < 1:

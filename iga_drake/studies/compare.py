@@ -186,7 +186,7 @@ def trained(name: str, weights: Path | None, *, particles: int, steps: int) -> T
         return Trained(
             name, str(path), aligner, card["samples_seen"], flops, float(card["seconds"])
         )
-    models = [found_model(part, weights, name) for part in PARTS[name]]
+    models = [found_model(part, weights, name)[0] for part in PARTS[name]]
     cards = [_card(part, weights, name) for part in PARTS[name]]
     search = LangevinConfig(particles=particles, steps=steps)
     made: Aligner
