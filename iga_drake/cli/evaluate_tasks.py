@@ -76,8 +76,8 @@ def _trials(arguments: argparse.Namespace) -> "list[Trial]":
             key: dict[str, Any] = {}
             if options or arguments.results:
                 made = episode_aligner(scenario, aligner, options)
-                made = None if isinstance(made, str) else made
-                key = trial_key(scenario, made, aligner, options)
+                seen = None if isinstance(made, str) else made
+                key = trial_key(scenario, seen, aligner, options)
             own = [f"--option={name}={json.dumps(value)}" for name, value in options.items()]
             trials += [
                 Trial(
