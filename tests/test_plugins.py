@@ -1,89 +1,98 @@
-"""An aligner and a task of another package: one file each, and metadata as pip would leave it."""
+"""An aligner and a task of another package, by name in every command that takes one."""
 
 import json
 import os
-import shutil
 from pathlib import Path
 
 import pytest
+from demonstration_fakes import ball, pose
+from outside_package import install
 
 from iga_drake import cli
-from iga_drake.paths import models_dir
+from iga_drake.demonstrations.demonstration import (
+    Demonstration,
+    DemonstrationSet,
+    Observation,
+    Waypoint,
+)
+from iga_drake.demonstrations.store import write_demonstrations
+from iga_drake.tasks.registry import make_task
 
-ALIGNER = """
+CODE = '''
 import numpy as np
 
 from iga_drake.aligners.protocol import PoseEstimate
+from iga_drake.tasks.grasp import Grasp
 
 
 class Still:
+    """Moves nothing, and notes how often it was asked."""
+
     name = "still"
 
-    def __init__(self, *, diary: str = ""):
+    def __init__(self, *, diary=""):
         self.diary = diary
 
     def align(self, context, grasped, target, *, seed=0):
         if self.diary:
             open(self.diary, "a").write(f"{len(context)} demonstrations\\n")
-        return PoseEstimate(np.eye(4)[None], [0.0], [1.0])
-"""
-TASK = """
-from iga_drake.tasks.grasp import Grasp
+        return PoseEstimate(np.eye(4)[None], np.zeros(1), np.ones(1))
 
 
 class Pick(Grasp):
     name = "pick"
-"""
-ENTRY_POINTS = """
-[iga_drake.aligners]
-still = still_aligner:Still
-
-[iga_drake.tasks]
-pick = pick_task:Pick
-"""
+'''
+ENTRY_POINTS = {
+    "iga_drake.aligners": {"still": "Still"},
+    "iga_drake.tasks": {"pick": "Pick"},
+}
 
 
-@pytest.fixture
-def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder on the import path, of this process and of those that it starts."""
+@pytest.fixture(autouse=True)
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the import path of this process and of those that it starts."""
     folder = tmp_path / "site"
-    info = folder / "tea_robotics-0.1.dist-info"
-    info.mkdir(parents=True)
-    (folder / "still_aligner.py").write_text(ALIGNER)
-    (folder / "pick_task.py").write_text(TASK)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: tea-robotics\nVersion: 0.1\n")
-    (info / "entry_points.txt").write_text(ENTRY_POINTS)
-    monkeypatch.syspath_prepend(folder)
-    path = os.environ.get("PYTHONPATH", "")
-    monkeypatch.setenv("PYTHONPATH", f"{folder}{os.pathsep}{path}" if path else str(folder))
-    return folder
+    folder.mkdir()
+    install(folder, CODE, ENTRY_POINTS)
+    monkeypatch.syspath_prepend(str(folder))
+    paths = [str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
 
 
 @pytest.fixture
-def scenario(tmp_path: Path) -> Path:
-    """Of the task `pick`, with the demonstrations of `grasp` under its name."""
-    demonstrations = tmp_path / "demonstrations"
-    shutil.copytree(models_dir() / "demonstrations" / "grasp", demonstrations)
-    manifest = demonstrations / "manifest.json"
-    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"task": "pick"}))
+def scenario(installed: None, tmp_path: Path) -> Path:
+    """Of the task `pick`, with made-up demonstrations that relate what the task relates."""
+    (motion,) = make_task("pick").motion.waypoints
+    demonstration = Demonstration(
+        observations={
+            motion.grasped: Observation(points=ball(0), role="gripper", frame="E"),
+            motion.target: Observation(points=ball(1, (0.5, 0, 0.05)), role="target", frame="W"),
+        },
+        waypoints=(
+            Waypoint(
+                motion.name, pose(0, (0.5, 0, 0.1)), 0.0, grasped=motion.grasped,
+                target=motion.target,
+            ),
+        ),
+    )  # fmt: skip
+    folder = tmp_path / "demonstrations"
+    write_demonstrations(folder, DemonstrationSet("pick", (demonstration,)))
     path = tmp_path / "pick.yaml"
-    path.write_text(f"task: {{name: pick, time_limit: 3}}\ndemonstrations: {demonstrations}\n")
+    path.write_text(f"task: {{name: pick, time_limit: 3}}\ndemonstrations: {folder}\n")
     return path
 
 
-def test_episodes_take_both(plugins: Path, scenario: Path, tmp_path: Path, capsys) -> None:
+def test_episodes_take_both(scenario: Path, tmp_path: Path, capsys) -> None:
     result, diary = tmp_path / "result.json", tmp_path / "diary"
     options = ["--aligner", "still", "--option", f"diary={diary}", "--result", str(result)]
     assert cli.main(["simulate", str(scenario), *options]) == cli.FAILURE
     assert "pick, seed 0, aligner still" in capsys.readouterr().out
     row = json.loads(result.read_text())
     assert (row["task"], row["aligner"]) == ("pick", "still")
-    assert row["cause"] == "alignment" and diary.read_text().endswith("3 demonstrations\n")
+    assert row["cause"] == "alignment" and diary.read_text().endswith("1 demonstrations\n")
 
 
-def test_evaluations_of_tasks_take_both(
-    plugins: Path, scenario: Path, tmp_path: Path, capsys
-) -> None:
+def test_evaluations_of_tasks_take_both(scenario: Path, tmp_path: Path, capsys) -> None:
     # The same name, another content: told apart, and not taken from the other's results.
     other = tmp_path / "other" / "pick.yaml"
     other.parent.mkdir()
@@ -103,7 +112,7 @@ def test_evaluations_of_tasks_take_both(
     assert again[1] == trial | {"scenario": str(other.with_suffix("")), "reused": True}
 
 
-def test_evaluations_of_alignments_take_it(plugins: Path, capsys) -> None:
+def test_evaluations_of_alignments_take_it(capsys) -> None:
     arguments = ["--aligner", "still,oracle", "--sets", "easy", "--count", "2"]
     assert cli.main(["evaluate", "alignment", *arguments]) == cli.SUCCESS
     lines = capsys.readouterr().out.splitlines()
@@ -112,7 +121,7 @@ def test_evaluations_of_alignments_take_it(plugins: Path, capsys) -> None:
     assert "{'speed': 3}: 'still' does not take them" in capsys.readouterr().err
 
 
-def test_comparisons_and_benchmarks_take_it(plugins: Path, capsys) -> None:
+def test_comparisons_and_benchmarks_take_it(capsys) -> None:
     arguments = ["--aligners", "still", "--sets", "easy", "--count", "1", "--json"]
     assert cli.main(["evaluate", "compare", *arguments]) == cli.SUCCESS
     (row,) = json.loads(capsys.readouterr().out)

@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Records and writes them; nothing of somebody else's is overwritten."""
-    from iga_drake.demonstrations.demonstration import check_replaceable, write_demonstrations
+    from iga_drake.demonstrations.store import check_replaceable, write_demonstrations
     from iga_drake.tasks.episode import record_demonstrations
 
     scenario = scenario_of(arguments)

@@ -6,16 +6,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from iga_drake.aligners.registry import EXPERT, check_aligner
+from iga_drake.aligners.registry import EXPERT
 from iga_drake.cli.options import add_aligner_options, aligner_options, names, seed
-from iga_drake.cli.scenarios import (
-    add_overlay_arguments,
-    episode_aligner,
-    scenario_of,
-    scenario_path,
-)
+from iga_drake.cli.scenarios import add_overlay_arguments, scenario_of, with_aligner
 from iga_drake.cli.status import CommandError
 
 if TYPE_CHECKING:
@@ -60,24 +55,19 @@ def run(arguments: argparse.Namespace) -> None:
 def _trials(arguments: argparse.Namespace) -> "list[Trial]":
     """Of every scenario with every aligner; all that was asked for is checked."""
     from iga_drake.evaluation.task_success import Trial, trial_key
+    from iga_drake.station.scenario import scenario_path
 
-    asked = [name for name in arguments.aligner if name != EXPERT]
-    for aligner in asked:
-        check_aligner(aligner)
-    given = aligner_options(arguments, asked)
+    given = aligner_options(arguments, [name for name in arguments.aligner if name != EXPERT])
     paths = [scenario_path(name) for name in arguments.tasks]
+    changes = [f"--with={overlay}" for overlay in arguments.overlays]
+    changes += [f"--set={override}" for override in arguments.overrides]
     trials = []
     for path, label in zip(paths, _labels(paths), strict=True):
-        scenario = scenario_of(arguments, path)
-        changes = [f"--with={scenario_path(overlay)}" for overlay in arguments.overlays]
-        changes += [f"--set={override}" for override in arguments.overrides]
+        scenario = scenario_of(arguments, str(path))
         for aligner in arguments.aligner:
             options = given.get(aligner, {})
-            key: dict[str, Any] = {}
-            if options or arguments.results:
-                made = episode_aligner(scenario, aligner, options)
-                seen = None if isinstance(made, str) else made
-                key = trial_key(scenario, seen, aligner, options)
+            chosen = with_aligner(scenario, aligner, options)
+            key = trial_key(chosen) if arguments.results else {}
             own = [f"--option={name}={json.dumps(value)}" for name, value in options.items()]
             trials += [
                 Trial(

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from iga_drake.cli.options import add_aligner_options, aligner_options, seed
-from iga_drake.cli.scenarios import add_scenario_arguments, episode_aligner, scenario_of
+from iga_drake.cli.scenarios import add_scenario_arguments, scenario_of, with_aligner
 from iga_drake.cli.status import FAILURE, SUCCESS
 from iga_drake.files import write_text
 
@@ -30,12 +30,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Runs the episode, tells how it goes, writes what was asked for."""
-    from iga_drake.tasks.episode import run_episode
+    from iga_drake.tasks.episode import Episode
 
     scenario = scenario_of(arguments)
     name = arguments.aligner or scenario.aligner.name
-    options = aligner_options(arguments, [name])[name]
-    aligner = episode_aligner(scenario, name, options)
+    scenario = with_aligner(scenario, name, aligner_options(arguments, [name])[name])
     live = arguments.meshcat or scenario.visualization.meshcat
     meshcat = None
     if live or arguments.html:
@@ -45,25 +44,23 @@ def run(arguments: argparse.Namespace) -> int:
         meshcat.StartRecording(set_visualizations_while_recording=live)
         if live:
             print(f"meshcat: {meshcat.web_url()}", flush=True)
-    result = run_episode(
-        scenario,
-        seed=arguments.seed,
-        aligner=aligner,
-        split=arguments.split,
-        meshcat=meshcat,
-        on_event=lambda line: print(line, flush=True),
-    )
+    seed, split = arguments.seed, arguments.split
+    with Episode(scenario, seed=seed, split=split, meshcat=meshcat) as episode:
+        print(f"{episode.task.name}, seed {seed}, aligner {name}, {split} objects", flush=True)
+        result = episode.run(on_event=lambda line: print(line, flush=True))
     if meshcat is not None:
         from iga_drake.viewing.replay import show_prediction, write_html
 
         meshcat.StopRecording()
         meshcat.PublishRecording()
-        show_prediction(
-            meshcat,
-            target=result.target_points,
-            grasped_E=result.grasped_points,
-            X_WE=result.X_WE_predicted,
-        )
+        for motion, waypoint in zip(episode.task.motion.waypoints, result.waypoints, strict=False):
+            show_prediction(
+                meshcat,
+                target=result.observations[motion.target].points,
+                grasped_E=result.observations[motion.grasped].points,
+                X_WE=waypoint.X_WE_predicted,
+                path=f"perception/{motion.name}",
+            )
         if arguments.html:
             write_html(meshcat, arguments.html)
             print(f"replay: {arguments.html}")

@@ -16,17 +16,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Prints a line about each demonstration and shows them all."""
-    from iga_drake.demonstrations.demonstration import read_demonstrations
+    from iga_drake.demonstrations.store import read_demonstrations
     from iga_drake.viewing.replay import demonstrations_html, serve_demonstrations
 
     demonstrations = read_demonstrations(arguments.folder)
     for index, demonstration in enumerate(demonstrations.demonstrations):
-        metadata = ", ".join(f"{key} {value}" for key, value in demonstration.metadata.items())
-        print(
-            f"{demonstrations.task} {index}: {len(demonstration.grasped)} grasped points, "
-            f"{len(demonstration.target)} target points, waypoints "
-            f"{', '.join(demonstration.names)}; {metadata}"
+        clouds = ", ".join(
+            f"{name} {len(seen.points)} points" for name, seen in demonstration.observations.items()
         )
+        waypoints = ", ".join(waypoint.name for waypoint in demonstration.waypoints)
+        source = demonstration.provenance.source or "unknown source"
+        print(f"{demonstrations.task} {index}: {clouds}; waypoints {waypoints}; {source}")
     if arguments.html:
         write_text(arguments.html, demonstrations_html(demonstrations))
         print(f"written: {arguments.html}")

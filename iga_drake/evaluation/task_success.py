@@ -13,15 +13,9 @@ from pathlib import Path
 from statistics import NormalDist
 from typing import Any
 
-from iga_drake.aligners.protocol import Aligner
+from iga_drake.aligners.registry import EXPERT, make_aligner
 from iga_drake.errors import IgaDrakeError
-from iga_drake.evaluation.results import (
-    ResultsStore,
-    aligner_key,
-    code_key,
-    folder_digest,
-    text_digest,
-)
+from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, folder_digest
 from iga_drake.station.scenario import Scenario
 from iga_drake.tasks.episode import demonstrations_path
 from iga_drake.tasks.registry import make_task
@@ -73,20 +67,19 @@ class TrialResult:
     reused: bool = False  # measured before, and found in a results file
 
 
-def trial_key(
-    scenario: Scenario, aligner: Aligner | None, name: str, options: Mapping[str, Any]
-) -> dict[str, Any]:
-    """What trials of a scenario with an aligner depend on besides seed and split.
+def trial_key(scenario: Scenario) -> dict[str, Any]:
+    """What trials of a scenario depend on besides seed and split. The aligner's weights are read.
 
-    None stands for the scripted expert. `options` are those given besides the scenario's.
+    Raises `AlignerError`.
     """
-    things = [make_task(scenario.task.name), *([aligner] if aligner else [])]
+    name, options = scenario.aligner.name, scenario.aligner.options
+    aligner = None if name == EXPERT else make_aligner(name, **options)
     return {
         "kind": "tasks",
-        "scenario": text_digest(scenario.to_yaml()),
+        "scenario": scenario.digest,
         "demonstrations": folder_digest(demonstrations_path(scenario)),
         **aligner_key(aligner, name, options),
-        "code": code_key(*things),
+        "code": code_key(aligner, make_task(scenario.task.name)),
     }
 
 

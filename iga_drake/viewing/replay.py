@@ -76,20 +76,17 @@ def write_html(meshcat: Meshcat, path: Path | str) -> None:
 def show_demonstrations(
     meshcat: Meshcat, demonstrations: DemonstrationSet, spacing: float = 0.6
 ) -> None:
-    """Shows each demonstration beside the other, along y: both clouds and the waypoints' frames."""
+    """Shows each demonstration beside the other, along y: for each waypoint the frame that the end
+    effector went to, the cloud that it carried there, and the cloud that stood there."""
     meshcat.SetCameraPose(np.array([2.3, 0.0, 1.0]), np.array([0.5, 0.0, 0.0]))
     for index, demonstration in enumerate(demonstrations.demonstrations):
         root = f"demonstrations/{index}"
-        show_cloud(meshcat, f"{root}/target cloud", demonstration.target, TARGET_COLOR)
-        for name, X in zip(demonstration.names, demonstration.X_WE, strict=True):
-            X_WE = RigidTransform(X)
-            show_triad(meshcat, f"{root}/{name}/X_WE", X_WE, length=0.06)
-            show_cloud(
-                meshcat,
-                f"{root}/{name}/grasped cloud",
-                (X_WE @ demonstration.grasped.T).T,
-                GRASPED_COLOR,
-            )
+        for k, waypoint in enumerate(demonstration.waypoints):
+            path = f"{root}/{waypoint.name}"
+            clouds = demonstration.alignment(k)
+            show_triad(meshcat, f"{path}/X_WE", RigidTransform(waypoint.X_WE), length=0.06)
+            show_cloud(meshcat, f"{path}/target cloud", clouds.target, TARGET_COLOR)
+            show_cloud(meshcat, f"{path}/grasped cloud", clouds.grasped, GRASPED_COLOR)
         middle = (len(demonstrations) - 1) / 2
         meshcat.SetTransform(root, RigidTransform([0.0, spacing * (index - middle), 0.0]))
 

@@ -6,17 +6,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from demonstration_fakes import make_set
 
 from iga_drake import cli
 from iga_drake.cli import shapes
 from iga_drake.cli.options import add_aligner_options, aligner_options
-from iga_drake.cli.scenarios import scenario_path
 from iga_drake.cli.status import CommandError
-from iga_drake.demonstrations.demonstration import write_demonstrations
+from iga_drake.demonstrations.store import write_demonstrations
 from iga_drake.paths import diagrams_dir
+from iga_drake.tasks.registry import make_task
 
 
 def refused(capsys: pytest.CaptureFixture, *arguments: str) -> str:
@@ -62,6 +61,8 @@ def test_aligners_are_checked_first(capsys):
     assert "{'speed': 3}: 'icp' does not take them" in line
     line = refused(capsys, "simulate", "grasp", "--aligner", "icp", "--option", "iga.speed=3")
     assert "'iga' is not among the aligners asked for: icp" in line
+    line = refused(capsys, "simulate", "grasp", "--aligner", "icp", "--option", "starts=null")
+    assert "a number or text is expected" in line
     line = refused(capsys, "simulate", "grasp", "--aligner", "expert", "--option", "speed=3")
     assert "the expert takes none" in line
 
@@ -135,7 +136,10 @@ def test_view_writes_a_page(capsys, tmp_path: Path):
     arguments = ("view", "demonstrations", str(tmp_path / "demos"), "--html", str(page))
     assert cli.main(arguments) == cli.SUCCESS
     assert page.read_text().lstrip().lower().startswith("<!doctype html>")
-    assert "40 grasped points, 60 target points" in capsys.readouterr().out
+    assert (
+        "thing in the hand 80 points, goal 80 points; waypoints grasp, place"
+        in capsys.readouterr().out
+    )
 
 
 def test_evaluate_refuses_what_it_does_not_know(capsys):
@@ -178,22 +182,39 @@ def test_bad_usage_has_exit_status_2(arguments: list[str]):
     assert exit_info.value.code == 2
 
 
-def test_scenarios_can_be_named():
-    assert scenario_path("stack") == diagrams_dir() / "stack.yaml"
-    assert scenario_path("stack.yaml") == diagrams_dir() / "stack.yaml"
+def test_values_of_a_scenario_can_be_set(capsys, tmp_path: Path):
+    overlay = tmp_path / "overlay.yaml"
+    overlay.write_text("task: {name: juggle}\n")
+    for command in (("simulate", "grasp"), ("demonstrate", "grasp", "--out", str(tmp_path / "o"))):
+        line = refused(capsys, *command, "--set", "task.name=walk")
+        assert "unknown task 'walk'" in line
+        assert "unknown task 'juggle'" in refused(capsys, *command, "--with", str(overlay))
+        assert "goal" in refused(capsys, *command, "--set", "task.goal=tea")
 
 
 def test_exit_status_follows_the_verdict(monkeypatch, tmp_path: Path):
     from iga_drake.tasks import episode
 
-    def fake(scenario, *, seed, aligner, split, meshcat, on_event):
-        return episode.EpisodeResult(
-            task="grasp", aligner="icp", seed=seed, split=split, success=seed == 1,
-            target_points=np.zeros((0, 3)),
-        )  # fmt: skip
+    class FakeEpisode:
+        def __init__(self, scenario, *, seed, split, meshcat):
+            self.task, self.seed, self.split = make_task(scenario.task.name), seed, split
+            assert scenario.aligner.name == "icp"
 
-    monkeypatch.setattr(episode, "run_episode", fake)
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def run(self, on_event):
+            return episode.EpisodeResult(
+                task="grasp", aligner="icp", seed=self.seed, split=self.split, scenario="",
+                success=self.seed == 1,
+            )  # fmt: skip
+
+    monkeypatch.setattr(episode, "Episode", FakeEpisode)
     path = tmp_path / "result.json"
-    assert cli.main(["simulate", "grasp", "--seed", "1", "--result", str(path)]) == cli.SUCCESS
+    command = ["simulate", "grasp", "--aligner", "icp", "--result", str(path)]
+    assert cli.main([*command, "--seed", "1"]) == cli.SUCCESS
     assert json.loads(path.read_text())["success"] is True
-    assert cli.main(["simulate", "grasp", "--seed", "2"]) == cli.FAILURE
+    assert cli.main([*command, "--seed", "2"]) == cli.FAILURE

@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 from scipy.stats import binomtest
 
-from iga_drake.aligners.registry import make_aligner
 from iga_drake.evaluation.results import ResultsStore
 from iga_drake.evaluation.task_success import (
     EvaluationError,
@@ -18,7 +17,6 @@ from iga_drake.evaluation.task_success import (
     trial_key,
     wilson_interval,
 )
-from iga_drake.paths import diagrams_dir
 from iga_drake.station.scenario import load_scenario
 
 
@@ -92,20 +90,19 @@ def test_results_of_other_conditions_are_not_taken_over(tmp_path: Path):
     assert [row["scenario"] for row in summarise(results)] == ["grasp", "b/grasp"]
 
 
-def test_trials_are_known_by_what_scenario_aligner_and_task_are(tmp_path: Path):
-    scenario = load_scenario(diagrams_dir() / "grasp.yaml")
-    icp, more = make_aligner("icp"), {"starts": 8}
+def test_trials_are_known_by_scenario_demonstrations_and_options(tmp_path: Path):
+    def scenario(*overrides: str):
+        return load_scenario("grasp", overrides=["aligner.name=icp", *overrides])
+
+    there = f"demonstrations={tmp_path}"
     keys = [
-        trial_key(scenario, icp, "icp", {}),
-        trial_key(scenario, icp, "icp", more),
-        trial_key(scenario, None, "expert", {}),
-        trial_key(replace(scenario, demonstrations=str(tmp_path)), icp, "icp", {}),
-        trial_key(load_scenario(diagrams_dir() / "stack.yaml"), icp, "icp", {}),
+        trial_key(scenario(*overrides))
+        for overrides in ((), ("aligner.options.starts=8",), ("aligner.name=expert",), (there,))
     ]
-    assert keys[0] == trial_key(scenario, make_aligner("icp"), "icp", {})
+    assert keys[0] == trial_key(scenario())
     assert len({json.dumps(key) for key in keys}) == len(keys)
     (tmp_path / "manifest.json").touch()
-    assert trial_key(replace(scenario, demonstrations=str(tmp_path)), icp, "icp", {}) != keys[3]
+    assert trial_key(scenario(there)) != keys[3]
 
 
 def test_summary_counts_and_names_causes():

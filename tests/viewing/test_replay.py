@@ -1,15 +1,15 @@
 from pathlib import Path
 
 import numpy as np
+from demonstration_fakes import make_set
 from pydrake.geometry import Rgba
 from pydrake.math import RigidTransform, RollPitchYaw
-from scipy.spatial.transform import Rotation
 
-from iga_drake.demonstrations.demonstration import Demonstration, DemonstrationSet
 from iga_drake.viewing.replay import (
     demonstrations_html,
     quiet_meshcat,
     show_cloud,
+    show_demonstrations,
     show_prediction,
     write_html,
 )
@@ -45,10 +45,9 @@ def test_an_empty_cloud_removes_the_old_one():
 
 
 def test_page_of_demonstrations():
-    demonstration = Demonstration(
-        grasped=POINTS, target=POINTS, openings=np.zeros(1), names=("goal",),
-        X_WE=np.block([[Rotation.random(random_state=0).as_matrix(), np.ones((3, 1))],
-                       [np.zeros((1, 3)), np.ones((1, 1))]])[None],
-    )  # fmt: skip
-    text = demonstrations_html(DemonstrationSet(task="grasp", demonstrations=(demonstration,)))
+    meshcat = quiet_meshcat()
+    show_demonstrations(meshcat, make_set())
+    for path in ("0/grasp/X_WE", "1/place/target cloud", "1/place/grasped cloud"):
+        assert meshcat.HasPath(f"/drake/demonstrations/{path}")
+    text = demonstrations_html(make_set())
     assert text.lstrip().lower().startswith("<!doctype html>")
