@@ -15,12 +15,12 @@ PACKAGE = Path(iga_drake.__file__).parent
 # The packages in order of the data's way: each may import from itself and from those before it.
 ORDER = (
     "geometry", "shapes", "dataset", "demonstrations", "aligners", "training", "planning",
-    "systems", "policy", "viewing", "station", "tasks", "evaluation", "studies",
+    "systems", "policy", "viewing", "station", "tasks", "evaluation", "studies", "cli",
 )  # fmt: skip
 # Usable by every package.
 ROOT_MODULES = {
     f"iga_drake.{name}"
-    for name in ("checkpoint", "errors", "files", "paths", "precision", "registry")
+    for name in ("checkpoint", "errors", "files", "paths", "precision", "registry", "version")
 }
 WITHOUT_DRAKE = ORDER[: ORDER.index("planning")]
 

@@ -47,7 +47,10 @@ class PoseEstimate:
 
 @runtime_checkable
 class Aligner(Protocol):
-    """Finds where the grasped object has to go, from demonstrations alone."""
+    """Finds where the grasped object has to go, from demonstrations alone.
+
+    An aligner with trained weights also has `weights_digest: str`, which differs where they do.
+    """
 
     name: str
 
@@ -65,3 +68,8 @@ class Aligner(Protocol):
         (`demonstrations.alignment`) for clouds that are empty, not finite or too small.
         """
         ...
+
+
+def weights_digest(aligner: Aligner) -> str:
+    """What tells the aligner's weights from others; empty where it has none."""
+    return str(getattr(aligner, "weights_digest", ""))

@@ -9,24 +9,25 @@ demonstrations show several alignments, the nearest one counts. Two kinds of err
   alignments that are the same up to the symmetry.
 """
 
-import json
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from iga_drake.aligners.iga.weights import DESCRIPTOR
 from iga_drake.aligners.protocol import Aligner
 from iga_drake.aligners.query import Query
-from iga_drake.checkpoint import load_checkpoint
+from iga_drake.aligners.registry import ORACLE
+from iga_drake.checkpoint import file_digest, load_checkpoint
 from iga_drake.dataset.alignment_error import CONFIG, equivalents, nearest_error, random_pose
 from iga_drake.dataset.oracle import oracle_pose
 from iga_drake.dataset.samples import make_sample
 from iga_drake.dataset.splits import sample_sets
 from iga_drake.errors import IgaDrakeError
+from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, config_digest
 
 FIVE_SETS = (
     "seen_alignments",
@@ -35,7 +36,6 @@ FIVE_SETS = (
     "unseen_categories",
     "multi_modal",
 )
-ORACLE = "oracle"
 THRESHOLDS = ((0.01, 5.0), (0.02, 10.0), (0.03, 15.0))  # m, deg
 
 
@@ -53,6 +53,7 @@ class SampleErrors:
     translation_modulo: float  # modulo symmetry
     rotation_modulo: float
     seconds: float
+    reused: bool = False  # measured before, and found in a results file
 
 
 @dataclass(frozen=True)
@@ -102,12 +103,14 @@ class AlignmentErrors:
     plain: Errors
     modulo: Errors  # modulo symmetry
     seconds_median: float
+    reused: int  # how many of the errors were found in a results file
 
     def rows(self) -> str:
         """Two lines of the table."""
         first = f"{self.aligner:<8} {self.split:<18} {self.count:>5}"
+        reused = f"  {self.reused} reused" if self.reused else ""
         return (
-            f"{first}  plain   {self.plain.columns()}  {self.seconds_median:6.2f}\n"
+            f"{first}  plain   {self.plain.columns()}  {self.seconds_median:6.2f}{reused}\n"
             f"{'':<33}  modulo  {self.modulo.columns()}"
         )
 
@@ -153,31 +156,39 @@ def evaluate_alignment(
     split: str,
     count: int,
     *,
-    results: Path | None = None,
-    version: str = "",
+    options: Mapping[str, Any] | None = None,
+    store: ResultsStore | None = None,
 ) -> tuple[AlignmentErrors, list[SampleErrors]]:
     """Aligns the first `count` samples of a set; every aligner gets the same samples and starts.
 
     Without an aligner the oracle answers; samples on which it has no answer are left out of the
-    means and of the count. `results` (JSON lines) is appended to and gone on from; it belongs to
-    one `version` of the aligner (the digest of its weights). Raises `IgaDrakeError`.
+    means and of the count. `options` are those that the aligner was made with; errors that the
+    store holds are taken from there, others put there. Raises `IgaDrakeError`.
     """
     if split not in sample_sets():
         raise IgaDrakeError(f"set '{split}' is not known; one of: {', '.join(sample_sets())}")
     if count < 1:
         raise IgaDrakeError(f"count {count}: at least 1 sample is needed")
     name = aligner.name if aligner else ORACLE
-    done = _read_results(results, name, version) if results else {}
+    common = {
+        "kind": "alignment",
+        "set": split,
+        "config": config_digest(CONFIG),
+        **aligner_key(aligner, name, options),
+        "code": code_key(aligner),
+    }
     rows: list[SampleErrors] = []
     for index in range(count):
-        row = done.get((name, split, index))
+        key = {**common, "index": index}
+        known = store.get(key) if store else None
+        if known is not None:
+            rows.append(SampleErrors(**known, reused=True))
+            continue
+        row = evaluate_sample(aligner, split, index)
         if row is None:
-            row = evaluate_sample(aligner, split, index)
-            if row is None:
-                continue
-            if results:
-                with results.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps({"version": version, **asdict(row)}) + "\n")
+            continue
+        if store:
+            store.add(key, {n: value for n, value in asdict(row).items() if n != "reused"})
         rows.append(row)
     if not rows:
         raise IgaDrakeError(f"{name}, set '{split}': no answer in {count} samples")
@@ -197,6 +208,7 @@ def summarise(rows: Iterable[SampleErrors]) -> AlignmentErrors:
         plain=Errors.of(table[:, 0], table[:, 1]),
         modulo=Errors.of(table[:, 2], table[:, 3]),
         seconds_median=float(np.median([r.seconds for r in rows])),
+        reused=sum(r.reused for r in rows),
     )
 
 
@@ -216,42 +228,6 @@ def by_category(rows: Iterable[SampleErrors]) -> str:
     return "\n".join(lines)
 
 
-def _read_results(
-    path: Path, aligner: str, version: str
-) -> dict[tuple[str, str, int], SampleErrors]:
-    """An aligner's finished samples in a results file; a torn last line is left out."""
-    done: dict[tuple[str, str, int], SampleErrors] = {}
-    if not path.is_file():
-        return done
-    text = path.read_text(encoding="utf-8")
-    if text and not text.endswith("\n"):  # the process was killed while it wrote
-        text = text[: text.rfind("\n") + 1]
-        path.write_text(text, encoding="utf-8")
-    for number, line in enumerate(text.splitlines(), 1):
-        try:
-            entry = json.loads(line)
-            found = entry.pop("version")
-            row = SampleErrors(**entry)
-        except (ValueError, TypeError, KeyError) as error:
-            raise IgaDrakeError(
-                f"{path}, line {number}: not a result of this command ({error}); name another file"
-            ) from error
-        if row.aligner != aligner:
-            continue
-        if found != version:
-            raise IgaDrakeError(
-                f"{path}, line {number}: made with weights {found}, not {version}: "
-                "name another file"
-            )
-        done[row.aligner, row.split, row.index] = row
-    return done
-
-
-def digest(weights: Path) -> str:
-    """Of a checkpoint's bytes: what results made with it are known by."""
-    return sha256(weights.read_bytes()).hexdigest()[:16]
-
-
 def model_card(weights: Path, errors: list[AlignmentErrors], *, kind: str = DESCRIPTOR) -> str:
     """Markdown: how weights of a kind were trained (from the file itself), and errors with them."""
     _, card = load_checkpoint(weights, kind=kind)
@@ -262,7 +238,7 @@ def model_card(weights: Path, errors: list[AlignmentErrors], *, kind: str = DESC
         "",
         f"{card['parameters']:,} parameters, {card['step']:,} steps, {card['samples_seen']:,} "
         f"{seen} in {card['seconds'] / 60:.0f} minutes, seed {seed}, commit {commit}, "
-        f"SHA-256 {digest(weights)}.",
+        f"SHA-256 {file_digest(weights)}.",
         "",
         "Errors: four demonstrations, the test pair's grasped cloud at a Haar-random pose; "
         "mean ± standard deviation (median); plain and modulo symmetry.",

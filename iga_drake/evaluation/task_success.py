@@ -6,27 +6,43 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
 
+from iga_drake.aligners.registry import EXPERT, make_aligner
 from iga_drake.errors import IgaDrakeError
+from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, folder_digest
+from iga_drake.station.scenario import Scenario
+from iga_drake.tasks.episode import demonstrations_path
+from iga_drake.tasks.registry import make_task
 
 
 class EvaluationError(IgaDrakeError):
-    """An evaluation can't be run or its results can't be read."""
+    """An evaluation can't be run."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
     """One episode to run."""
 
-    scenario: str  # path of the scenario's YAML
+    task: str
+    scenario: str  # what it is called in tables
+    # The scenario for `iga simulate`: its file, and options that change it or the aligner's.
+    arguments: tuple[str, ...]
     aligner: str
     seed: int
+    split: str = "test"
+    # All that the result depends on besides seed and split: see `trial_key`.
+    key: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def whole_key(self) -> dict[str, Any]:
+        """What the result is stored by."""
+        return {**self.key, "split": self.split, "seed": self.seed}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,11 +50,10 @@ class TrialResult:
     """What became of a trial."""
 
     task: str
-    # Name of the scenario's file without its suffix; the task's name where it isn't stated.
-    scenario: str = ""
+    scenario: str  # what it is called in tables
     aligner: str
     seed: int
-    split: str = "test"
+    split: str
     success: bool
     # perception, alignment, IK, contact, time; "error" where the process itself broke.
     cause: str = ""
@@ -49,14 +64,23 @@ class TrialResult:
     inference_seconds: float | None = None
     real_time_factor: float | None = None
     wall_seconds: float | None = None
+    reused: bool = False  # measured before, and found in a results file
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "scenario", self.scenario or self.task)
 
-    @property
-    def key(self) -> tuple[str, str, int, str]:
-        """What tells this trial from every other one."""
-        return self.scenario, self.aligner, self.seed, self.split
+def trial_key(scenario: Scenario) -> dict[str, Any]:
+    """What trials of a scenario depend on besides seed and split. The aligner's weights are read.
+
+    Raises `AlignerError`.
+    """
+    name, options = scenario.aligner.name, scenario.aligner.options
+    aligner = None if name == EXPERT else make_aligner(name, **options)
+    return {
+        "kind": "tasks",
+        "scenario": scenario.digest,
+        "demonstrations": folder_digest(demonstrations_path(scenario)),
+        **aligner_key(aligner, name, options),
+        "code": code_key(aligner, make_task(scenario.task.name)),
+    }
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -76,17 +100,16 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     return low, high
 
 
-def run_trial(trial: Trial, *, task: str, split: str, timeout: float = 1800.0) -> TrialResult:
+def run_trial(trial: Trial, *, timeout: float = 1800.0) -> TrialResult:
     """Runs one episode in a process of its own; a broken process is a failed trial."""
     with tempfile.TemporaryDirectory(prefix="iga_trial_") as folder:
         path = Path(folder) / "result.json"
         command = [
-            sys.executable, "-m", "iga_drake.cli", "simulate", trial.scenario,
-            "--seed", str(trial.seed), "--aligner", trial.aligner, "--split", split,
+            sys.executable, "-m", "iga_drake.cli", "simulate", *trial.arguments,
+            "--seed", str(trial.seed), "--aligner", trial.aligner, "--split", trial.split,
             "--result", str(path),
         ]  # fmt: skip
         environment = os.environ | {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
-        reason = ""
         try:
             done = subprocess.run(
                 command, capture_output=True, text=True, timeout=timeout, env=environment
@@ -96,80 +119,52 @@ def run_trial(trial: Trial, *, task: str, split: str, timeout: float = 1800.0) -
         except subprocess.TimeoutExpired:
             reason = f"no verdict within {timeout:g} s of wall-clock time"
         if path.is_file():
-            row = json.loads(path.read_text(encoding="utf-8"))
-            return result_from_json(row | {"scenario": Path(trial.scenario).stem})
+            return _result(trial, json.loads(path.read_text(encoding="utf-8")))
+    broken = {"task": trial.task, "success": False, "cause": "error", "reason": reason}
+    return _result(trial, broken)
+
+
+_MEASURED = (
+    "task", "success", "cause", "reason", "position_error", "rotation_error", "inference_seconds",
+    "real_time_factor", "wall_seconds",
+)  # fmt: skip
+
+
+def _result(trial: Trial, row: Mapping[str, Any], *, reused: bool = False) -> TrialResult:
+    """What a row says of a trial; other values of the row are left out."""
     return TrialResult(
-        task=task, scenario=Path(trial.scenario).stem, aligner=trial.aligner, seed=trial.seed,
-        split=split, success=False, cause="error", reason=reason,
+        scenario=trial.scenario, aligner=trial.aligner, seed=trial.seed, split=trial.split,
+        reused=reused, **{name: row[name] for name in _MEASURED if name in row},
     )  # fmt: skip
 
 
-def result_from_json(row: dict[str, Any]) -> TrialResult:
-    """A result from a row of a results file; keys that it doesn't know are left out."""
-    names = {field.name for field in fields(TrialResult)}
-    try:
-        return TrialResult(**{name: value for name, value in row.items() if name in names})
-    except TypeError as error:
-        raise EvaluationError(f"a row of results lacks a value: {error}: {row}") from error
-
-
-def read_results(path: Path) -> list[TrialResult]:
-    """Rows of a results file, one JSON object a line; a last line that was cut off is left out."""
-    if not path.is_file():
-        return []
-    lines = path.read_text(encoding="utf-8").splitlines()
-    results = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            results.append(result_from_json(json.loads(line)))
-        except ValueError as error:
-            if number == len(lines):
-                break
-            raise EvaluationError(
-                f"{path}, line {number}: not JSON ({error}): remove the line or name another file"
-            ) from error
-    return results
-
-
 def evaluate(
-    trials: Sequence[tuple[str, Trial]],
+    trials: Sequence[Trial],
     *,
-    split: str = "test",
     processes: int = 1,
-    results_file: Path | None = None,
+    store: ResultsStore | None = None,
     on_result: Callable[[TrialResult], None] = lambda result: None,
-    run: Callable[..., TrialResult] = run_trial,
+    run: Callable[[Trial], TrialResult] = run_trial,
 ) -> list[TrialResult]:
-    """Runs (task, trial) pairs, `processes` at a time, leaving out those in `results_file`.
+    """Runs trials, `processes` at a time; those that the store holds are taken from there.
 
-    Each result is appended to `results_file` as soon as it is there, so an interrupted evaluation
-    goes on where it stopped. Trials are told apart by scenario, aligner, seed and split.
+    Each result is stored as soon as it is there, so an interrupted evaluation goes on where it
+    stopped.
     """
-    known = {r.key: r for r in read_results(results_file)} if results_file else {}
-    if results_file:
-        _rewrite(results_file, known.values())
 
-    def one(pair: tuple[str, Trial]) -> TrialResult:
-        task, trial = pair
-        result = known.get((Path(trial.scenario).stem, trial.aligner, trial.seed, split))
-        if result is None:
-            result = run(trial, task=task, split=split)
-            if results_file:
-                with results_file.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(asdict(result)) + "\n")
+    def one(trial: Trial) -> TrialResult:
+        row = store.get(trial.whole_key) if store else None
+        if row is not None:
+            result = _result(trial, row, reused=True)
+        else:
+            result = run(trial)
+            if store:
+                store.add(trial.whole_key, {n: getattr(result, n) for n in _MEASURED})
         on_result(result)
         return result
 
     with ThreadPoolExecutor(max_workers=max(1, processes)) as executor:
         return list(executor.map(one, trials))
-
-
-def _rewrite(path: Path, results: Iterable[TrialResult]) -> None:
-    """Drops a line that was cut off, so that appending starts on a line of its own."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text("".join(json.dumps(asdict(r)) + "\n" for r in results), encoding="utf-8")
-    partial.replace(path)
 
 
 def _median(values: Iterable[float | None]) -> float | None:
@@ -197,6 +192,7 @@ def summarise(results: Sequence[TrialResult]) -> list[dict[str, Any]]:
                 "median_rotation_error_rad": _median(r.rotation_error for r in mine),
                 "median_inference_s": _median(r.inference_seconds for r in mine),
                 "median_real_time_factor": _median(r.real_time_factor for r in mine),
+                "reused": sum(r.reused for r in mine),
                 "failures": [
                     {"seed": r.seed, "cause": r.cause, "reason": r.reason}
                     for r in mine
@@ -209,8 +205,12 @@ def summarise(results: Sequence[TrialResult]) -> list[dict[str, Any]]:
 
 def format_table(results: Sequence[TrialResult]) -> str:
     """The summary as text: one line for each scenario and aligner, then each failure's cause."""
+    rows = summarise(results)
+    wide = max(8, *(len(row["scenario"]) for row in rows))
+    name_wide = max(8, *(len(row["aligner"]) for row in rows))
     lines = [
-        f"{'scenario':8} {'aligner':8} {'success':>8}  {'95 % (Wilson)':>14}  {'position':>9}  "
+        f"{'scenario':{wide}} {'aligner':{name_wide}} {'success':>8}  {'95 % (Wilson)':>14}  "
+        f"{'position':>9}  "
         f"{'rotation':>9}  {'inference':>9}  {'real time':>9}"
     ]
 
@@ -218,15 +218,17 @@ def format_table(results: Sequence[TrialResult]) -> str:
         return "-" if value is None else f"{scale * value:.2f} {unit}"
 
     failures = []
-    for row in summarise(results):
+    for row in rows:
         low, high = row["wilson_95"]
         lines.append(
-            f"{row['scenario']:8} {row['aligner']:8} {row['successes']:>3} / {row['trials']:<2}  "
+            f"{row['scenario']:{wide}} {row['aligner']:{name_wide}} "
+            f"{row['successes']:>3} / {row['trials']:<2}  "
             f"{100 * low:>5.0f} - {100 * high:>3.0f} %  "
             f"{number(row['median_position_error_m'], 100, 'cm'):>9}  "
             f"{number(row['median_rotation_error_rad'], 180 / math.pi, 'deg'):>9}  "
             f"{number(row['median_inference_s'], 1, 's'):>9}  "
             f"{number(row['median_real_time_factor'], 1, 'x'):>9}"
+            + (f"  {row['reused']} reused" if row["reused"] else "")
         )
         failures += [
             f"  {row['scenario']} {row['aligner']} seed {f['seed']}: {f['cause']}: {f['reason']}"

@@ -36,11 +36,11 @@ from iga_drake.aligners.iga.local_encoder import load_encoder
 from iga_drake.aligners.iga.voting import VotingConfig
 from iga_drake.aligners.iga.weights import DESCRIPTOR, ENERGY, load_descriptor, load_energy
 from iga_drake.aligners.protocol import Aligner, PoseEstimate
-from iga_drake.checkpoint import save_checkpoint
+from iga_drake.checkpoint import file_digest, save_checkpoint
 from iga_drake.dataset.samples import SampleConfig
 from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.errors import IgaDrakeError
-from iga_drake.evaluation.alignment import digest
+from iga_drake.evaluation.results import ResultsStore, code_key
 from iga_drake.files import write_text
 from iga_drake.geometry.se3 import rigid
 from iga_drake.paths import models_dir
@@ -189,6 +189,7 @@ class Row:
     parameters: int  # trained
     errors: dict[str, float]  # see `alignment_errors`; also query_s, median
     matches: dict[str, float]  # top-1 rate, errors as shares of the size
+    reused: bool = field(default=False, compare=False)  # found in the folder's results
 
     def text(self) -> str:
         """Of the table."""
@@ -204,7 +205,7 @@ class Row:
         return (
             f"{self.name:<29} {self.change:<38} {self.parameters:>10,} {self.samples_seen:>8,} "
             f"{self.seconds:>7.0f}  {'  '.join(columns)}  {query:>7}  {matches}"
-        ).rstrip()
+        ).rstrip() + ("  reused" if self.reused else "")
 
 
 HEADER = (
@@ -286,20 +287,23 @@ class Ablations:
     def run(self, variants: Sequence[Variant]) -> Iterator[Row]:
         """The row of every variant, as they are finished. Raises `IgaDrakeError`."""
         self._check(variants)
-        path = self.folder / "results.jsonl"
-        done = _read(path)
+        store = ResultsStore(self.folder / "results.jsonl")
         for variant in variants:
             conditions = self._conditions(variant)
-            row = done.get(variant.name)
-            if row is None:
-                row = self._measure(variant, conditions)
-                done[row.name] = row
-                write_text(path, "".join(json.dumps(asdict(r)) + "\n" for r in done.values()))
-            elif row.conditions != conditions:
-                raise AblationError(
-                    f"{path}: '{row.name}' was measured with {row.conditions}, now asked for with "
-                    f"{conditions}: ask for the same or name another folder"
-                )
+            key = {"kind": "ablations", "variant": variant.name, "conditions": conditions}
+            for other, _ in store.rows():
+                if other["variant"] == variant.name and other["conditions"] != conditions:
+                    raise AblationError(
+                        f"{store.path}: '{variant.name}' was measured with {other['conditions']}, "
+                        f"now asked for with {conditions}: ask for the same or name another folder"
+                    )
+            key["code"] = code_key()
+            known = store.get(key)
+            if known is not None:
+                yield Row(**known, reused=True)
+                continue
+            row = self._measure(variant, conditions)
+            store.add(key, {n: v for n, v in asdict(row).items() if n != "reused"})
             yield row
 
     def measured(self, group: str) -> str:
@@ -337,7 +341,7 @@ class Ablations:
         return files
 
     def _conditions(self, variant: Variant) -> dict[str, Any]:
-        files = {name: digest(path) for name, path in self._files(variant).items()}
+        files = {name: file_digest(path) for name, path in self._files(variant).items()}
         if variant.group == INFERENCE:
             return {"count": self.count} | files
         conditions: dict[str, Any] = {"count": self.count, "steps": self._steps(variant.group)}
@@ -423,7 +427,7 @@ class Ablations:
         occupancy, _ = load_encoder(self.encoder)
         weights = occupancy.encoder.state_dict(prefix="local.encoder.")
         path = folder / "start.safetensors"
-        save_checkpoint(path, weights, kind=DESCRIPTOR, card={"encoder": digest(self.encoder)})
+        save_checkpoint(path, weights, kind=DESCRIPTOR, card={"encoder": file_digest(self.encoder)})
         return path
 
     def _steps(self, group: str) -> int:
@@ -472,23 +476,6 @@ def _trained(card: dict) -> dict[str, Any]:
 
 def _untrained() -> dict[str, Any]:
     return {"samples_seen": 0, "seconds": 0.0, "parameters": 0, "matches": {}}
-
-
-def _read(path: Path) -> dict[str, Row]:
-    """The finished variants in a results file, by name. Raises `AblationError`."""
-    if not path.is_file():
-        return {}
-    rows = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-        try:
-            row = Row(**json.loads(line))
-        except (ValueError, TypeError) as error:
-            raise AblationError(
-                f"{path}, line {number}: not a result of this command ({error}): name another "
-                "folder"
-            ) from error
-        rows[row.name] = row
-    return rows
 
 
 def chosen(names: Sequence[str] | None) -> list[Variant]:

@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true")
 
 
-def main(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Prints samples/s on one thread, shares of the time, memory and the cameras' ratio."""
     if arguments.count < 1:
         raise IgaDrakeError(f"--count {arguments.count}: at least 1 is needed")

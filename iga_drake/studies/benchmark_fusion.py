@@ -196,15 +196,12 @@ def _open3d(scenario: Scenario, images: Images) -> Callable[[], int] | None:
     return run
 
 
-def main(argv: list[str] | None = None) -> int:
-    """`iga benchmark fusion [--json] [--repetitions N]`."""
-    parser = argparse.ArgumentParser(prog="iga benchmark fusion", description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `iga benchmark fusion`."""
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--repetitions", type=int, default=15, help="timed runs of each")
-    arguments = parser.parse_args(argv)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Prints the times."""
     benchmark_fusion(json=arguments.json, repetitions=arguments.repetitions)
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

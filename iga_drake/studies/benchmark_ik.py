@@ -4,7 +4,6 @@ import argparse
 import json as json_format
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -224,16 +223,14 @@ def _describe(result: IkBenchmark) -> str:
     )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; exit status 0 only if no limit was broken."""
-    parser = argparse.ArgumentParser(prog="iga benchmark ik", description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `iga benchmark ik`."""
     parser.add_argument("--count", type=int, default=1000, help="number of poses")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    arguments = parser.parse_args(argv)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Exit status 0 only if no limit was broken."""
     result = benchmark_ik(arguments.count, arguments.seed, arguments.json)
     return 0 if result.limits_kept else 1
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,5 +1,5 @@
-"""`iga benchmark inference`: time to infer one waypoint, the default aligner beside a peer in the
-same run: ICP, or the paper's sampler (100 particles, 70 steps for each network)."""
+"""`iga benchmark inference`: time to infer one waypoint, of two aligners in the same run; iga-paper
+is the paper's sampler (100 particles, 70 steps for each network)."""
 
 import argparse
 import json
@@ -13,7 +13,7 @@ from iga_drake.aligners.iga_paper.aligner import IgaPaperAligner
 from iga_drake.aligners.iga_paper.graph import SIZES, GraphConfig
 from iga_drake.aligners.iga_paper.model import PaperModel
 from iga_drake.aligners.protocol import Aligner
-from iga_drake.aligners.registry import make_aligner
+from iga_drake.aligners.registry import aligner_names, make_aligner
 from iga_drake.dataset.samples import make_sample
 from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.errors import IgaDrakeError
@@ -23,7 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the benchmark."""
     parser.add_argument("--count", type=int, default=10, help="waypoints inferred (default 10)")
     parser.add_argument("--demonstrations", type=int, default=4, choices=range(1, 5))
-    parser.add_argument("--against", choices=("icp", "iga-paper"), default="icp", help="the peer")
+    known = aligner_names()
+    parser.add_argument("--aligner", choices=known, default="iga", help="(default iga)")
+    parser.add_argument("--against", choices=known, default="icp", help="the peer (default icp)")
     parser.add_argument(
         "--size", choices=SIZES, default="full",
         help="of iga-paper's networks, here untrained, which costs no less (default: the paper's)",
@@ -51,15 +53,17 @@ def _times(aligner: Aligner, count: int, demonstrations: int) -> np.ndarray:
     return np.array(seconds[1:])
 
 
-def main(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Prints median, minimum and maximum of both aligners and the ratio of the medians."""
     for name in ("count", "threads"):
         if getattr(arguments, name) < 1:
             raise IgaDrakeError(f"--{name} {getattr(arguments, name)}: at least 1 is needed")
     torch.set_num_threads(arguments.threads)
     result: dict[str, dict[str, float]] = {}
-    peer, count = arguments.against, arguments.count
-    for name in ("iga", peer):
+    own, peer, count = arguments.aligner, arguments.against, arguments.count
+    if own == peer:
+        raise IgaDrakeError(f"--against {peer}: the same as --aligner, name another one")
+    for name in (own, peer):
         paper = name == "iga-paper"
         aligner = _untrained_paper(arguments.size) if paper else make_aligner(name)
         seconds = _times(aligner, count, arguments.demonstrations)
@@ -68,10 +72,10 @@ def main(arguments: argparse.Namespace) -> int:
             "min_s": float(seconds.min()),
             "max_s": float(seconds.max()),
         }
-    ratio = result[peer]["median_s"] / result["iga"]["median_s"]
+    ratio = result[peer]["median_s"] / result[own]["median_s"]
     if arguments.json:
         settings = {k: getattr(arguments, k) for k in ("count", "demonstrations", "threads")}
-        print(json.dumps({**settings, **result, f"ratio_{peer}_to_iga": ratio}))
+        print(json.dumps({**settings, **result, f"ratio_{peer}_to_{own}": ratio}))
         return 0
     print(
         f"one waypoint, {arguments.demonstrations} demonstrations, {arguments.count} problems, "
@@ -81,5 +85,5 @@ def main(arguments: argparse.Namespace) -> int:
         print(
             f"  {name:<9} {row['median_s']:.3f} s median ({row['min_s']:.3f} to {row['max_s']:.3f})"
         )
-    print(f"  {peer} / iga: {ratio:.2f}")
+    print(f"  {peer} / {own}: {ratio:.2f}")
     return 0

@@ -45,7 +45,7 @@ def batched(pair: tuple[Nodes, Nodes]) -> tuple[Nodes, Nodes]:
     return a, b
 
 
-def main(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Prints medians and the ratio of the sums."""
     for name in ("alignments", "demonstrations", "channels", "count", "threads"):
         if getattr(arguments, name) < 1:

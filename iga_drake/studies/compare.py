@@ -6,8 +6,8 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,8 @@ from iga_drake.dataset.samples import Sample, SampleConfig, make_sample
 from iga_drake.dataset.splits import sample_sets
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.alignment import Errors
+from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, config_digest
+from iga_drake.files import write_text
 from iga_drake.training.descriptor import DescriptorTraining, correspondence_loss
 from iga_drake.training.paper import (
     ENERGIES,
@@ -53,7 +55,6 @@ from iga_drake.viewing.figures import check_figure, new_figure, write_figure
 
 PARTS = {"iga-paper": ("rotation", "translation"), "dirreg": ("dirreg",), "dfm": ("dfm",)}
 DESCRIPTORS = ("iga", "iga-energy")  # of their training, that of the descriptors is counted
-LEARNED = (*DESCRIPTORS, *PARTS)
 COMPARED = ("iga", *PARTS)
 
 
@@ -62,13 +63,14 @@ class Trained:
     """An aligner, and what its training took."""
 
     name: str
-    weights: str
+    weights: str  # where they were read
     aligner: Aligner
     samples_seen: int  # by each of its networks
     # Of the whole training, matrix products forward and backward; what came before the last leg of
     # a training at that leg's operations for each sample.
     flops: float
     seconds: float  # of the whole training, on whatever machine it ran
+    options: Mapping[str, Any] = field(default_factory=dict)  # of its search
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,7 @@ class Compared:
     training_seconds: float
     inference_seconds: float  # median
     errors: Errors
+    reused: int  # how many of the errors were found in a results file
 
     def row(self) -> str:
         """Of the table."""
@@ -91,7 +94,7 @@ class Compared:
             f"{self.name:<10} {self.split:<18} {self.count:>5} {self.samples_seen:>9,} "
             f"{self.flops:9.1e} {self.training_seconds / 60:8.0f} {self.inference_seconds:8.2f}  "
             f"{self.errors.columns()}"
-        )
+        ) + (f"  {self.reused} reused" if self.reused else "")
 
 
 HEADER = (
@@ -174,10 +177,12 @@ def descriptor_flops(weights: Path) -> float:
 def trained(name: str, weights: Path | None, *, particles: int, steps: int) -> Trained:
     """An aligner from a checkpoint (of iga-paper: the folder of two; default: the landed ones).
 
-    particles and steps are those of the samplers. Raises `IgaDrakeError`.
+    particles and steps are those of the paper's samplers. Of an aligner whose training isn't known
+    here its samples, operations and seconds are 0. Raises `IgaDrakeError`.
     """
-    if name not in LEARNED:
-        raise IgaDrakeError(f"aligner '{name}' is not compared; one of: {', '.join(LEARNED)}")
+    if name not in PARTS and name not in DESCRIPTORS:
+        options = {"weights": weights} if weights else {}
+        return Trained(name, str(weights or ""), make_aligner(name, **options), 0, 0.0, 0.0)
     if name in DESCRIPTORS:
         path = weights or default_weights()
         aligner = make_aligner(name, weights=path)
@@ -186,7 +191,7 @@ def trained(name: str, weights: Path | None, *, particles: int, steps: int) -> T
         return Trained(
             name, str(path), aligner, card["samples_seen"], flops, float(card["seconds"])
         )
-    models = [found_model(part, weights, name) for part in PARTS[name]]
+    models = [found_model(part, weights, name)[0] for part in PARTS[name]]
     cards = [_card(part, weights, name) for part in PARTS[name]]
     search = LangevinConfig(particles=particles, steps=steps)
     made: Aligner
@@ -207,6 +212,7 @@ def trained(name: str, weights: Path | None, *, particles: int, steps: int) -> T
         max(seen),
         float(np.dot(per_sample, seen)),
         float(sum(each["seconds"] for each in told)),
+        {"particles": particles, "steps": steps},
     )
 
 
@@ -231,17 +237,34 @@ def compare(
     *,
     frames: str = "own",
     cloud_points: int = CONFIG.cloud_points,
+    store: ResultsStore | None = None,
 ) -> Compared:
-    """Errors of an aligner on the first `count` samples of a set."""
+    """Errors of an aligner on the first `count` samples of a set; those that the store holds are
+    taken from there."""
     if split not in sample_sets():
         raise IgaDrakeError(f"set '{split}' is not known; one of: {', '.join(sample_sets())}")
     if count < 1:
         raise IgaDrakeError(f"count {count}: at least 1 sample is needed")
     if cloud_points < 16:
         raise IgaDrakeError(f"--cloud-points {cloud_points}: at least 16 are needed")
-    rows, seconds = [], []
+    config = dataclasses.replace(CONFIG, cloud_points=cloud_points)
+    common = {
+        "kind": "compare",
+        "set": split,
+        "config": config_digest(config),
+        "frames": frames,
+        **aligner_key(entry.aligner, entry.name, entry.options),
+        "code": code_key(entry.aligner),
+    }
+    rows, seconds, reused = [], [], 0
     for index in range(count):
-        config = dataclasses.replace(CONFIG, cloud_points=cloud_points)
+        key = {**common, "index": index}
+        known = store.get(key) if store else None
+        if known is not None:
+            rows.append((known["translation"], known["rotation"]))
+            seconds.append(known["seconds"])
+            reused += 1
+            continue
         sample = make_sample(split, index, config)
         if frames == "common":
             sample = in_common_frames(sample)
@@ -251,6 +274,9 @@ def compare(
         seconds.append(time.perf_counter() - began)
         valid = equivalents(sample, symmetry=True)
         rows.append(nearest_error(motion, valid, sample.points[0, -1]))
+        if store:
+            measured = zip(("translation", "rotation"), rows[-1], strict=True)
+            store.add(key, {**dict(measured), "seconds": seconds[-1]})
     translation, rotation = np.array(rows).T
     return Compared(
         name=entry.name,
@@ -262,6 +288,7 @@ def compare(
         training_seconds=entry.seconds,
         inference_seconds=float(np.median(seconds)),
         errors=Errors.of(translation, rotation),
+        reused=reused,
     )
 
 
@@ -339,7 +366,7 @@ def _weights(text: str) -> tuple[str, Path]:
 
 def add_compare(parser: argparse.ArgumentParser) -> None:
     """Options of `iga evaluate compare`."""
-    parser.description = "Learned aligners on the same problems, and what their training took."
+    parser.description = "Aligners on the same problems, and what their training took."
     parser.add_argument("--aligners", default=",".join(COMPARED), help="names, comma-separated")
     parser.add_argument(
         "--weights", type=_weights, action="append", default=[], metavar="NAME=PATH",
@@ -358,6 +385,7 @@ def add_compare(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--particles", type=int, default=LangevinConfig.particles)
     parser.add_argument("--steps", type=int, default=LangevinConfig.steps, help="of the samplers")
+    parser.add_argument("--results", type=Path, help="results file to append to and go on from")
     parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch")
     parser.add_argument("--png", type=Path, metavar="OUT", help="figure")
     parser.add_argument("--card", type=Path, metavar="OUT", help="model card of one aligner")
@@ -374,6 +402,7 @@ def evaluate_compare(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(arguments.threads)
     if arguments.card and (len(names) != 1 or names[0] not in PARTS):
         raise IgaDrakeError(f"--card: of one of {', '.join(PARTS)}, not of {', '.join(names)}")
+    store = ResultsStore(arguments.results) if arguments.results else None
     rows = []
     if not arguments.json:
         print(HEADER)
@@ -388,6 +417,7 @@ def evaluate_compare(arguments: argparse.Namespace) -> None:
                     arguments.count,
                     frames=arguments.frames,
                     cloud_points=arguments.cloud_points,
+                    store=store,
                 )
                 rows.append(found)
                 if not arguments.json:
@@ -400,5 +430,4 @@ def evaluate_compare(arguments: argparse.Namespace) -> None:
         weights = arguments.weights[-1][1] if arguments.weights else None
         cards = {kind_of(part): _card(part, weights, names[0]) for part in PARTS[names[0]]}
         some = [row for row in rows if row.weights == rows[-1].weights]
-        arguments.card.parent.mkdir(parents=True, exist_ok=True)
-        arguments.card.write_text(model_card(some, cards, arguments.frames), encoding="utf-8")
+        write_text(arguments.card, model_card(some, cards, arguments.frames))

@@ -97,7 +97,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="every familiarity")
 
 
-def main(arguments: argparse.Namespace, aligner: Aligner | None = None) -> int:
+def run(arguments: argparse.Namespace, aligner: Aligner | None = None) -> int:
     """Prints both kinds of error by threshold."""
     names: Sequence[str] = arguments.sets.split(",")
     for name in names:

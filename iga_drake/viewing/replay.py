@@ -76,7 +76,8 @@ def write_html(meshcat: Meshcat, path: Path | str) -> None:
 def show_demonstrations(
     meshcat: Meshcat, demonstrations: DemonstrationSet, spacing: float = 0.6
 ) -> None:
-    """Shows each demonstration beside the other, along y: both clouds and the waypoints' frames."""
+    """Shows each demonstration beside the other, along y: for each waypoint the frame that the end
+    effector went to, the cloud that it carried there, and the cloud that stood there."""
     meshcat.SetCameraPose(np.array([2.3, 0.0, 1.0]), np.array([0.5, 0.0, 0.0]))
     for index, demonstration in enumerate(demonstrations.demonstrations):
         root = f"demonstrations/{index}"

@@ -20,6 +20,7 @@ from iga_drake.dataset.alignment_error import (
 from iga_drake.dataset.samples import make_sample
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.alignment import by_category, evaluate_alignment, model_card
+from iga_drake.evaluation.results import ResultsStore
 from iga_drake.shapes.families import FAMILIES
 
 
@@ -100,20 +101,22 @@ def test_errors_modulo_symmetry_forgive_the_family_s_own_turns_and_no_others() -
             assert nearest_error(turn, equivalents(vase, symmetry=True), cloud) == plain
 
 
-def test_results_are_gone_on_from_and_belong_to_one_version(tmp_path: Path) -> None:
+def test_results_are_gone_on_from_and_belong_to_weights_and_options(tmp_path: Path) -> None:
     file = tmp_path / "results.jsonl"
     aligner = _Fixed(np.eye(4))
-    evaluate_alignment(aligner, "validation", 2, results=file, version="a")
-    file.write_text(file.read_text() + '{"version": "a", "alig')  # killed while writing
-    row, _ = evaluate_alignment(aligner, "validation", 3, results=file, version="a")
-    assert aligner.calls == 3 and row.count == 3
-    again, _ = evaluate_alignment(aligner, "validation", 3, results=file, version="a")
-    assert aligner.calls == 3 and again == row
-    with pytest.raises(IgaDrakeError, match="made with weights a, not b"):
-        evaluate_alignment(aligner, "validation", 3, results=file, version="b")
-    file.write_text("hello\n")
-    with pytest.raises(IgaDrakeError, match="line 1: not a result"):
-        evaluate_alignment(aligner, "validation", 1, results=file, version="a")
+    evaluate_alignment(aligner, "validation", 2, store=ResultsStore(file))
+    store = ResultsStore(file)
+    row, rows = evaluate_alignment(aligner, "validation", 3, store=store)
+    assert aligner.calls == 3 and row.count == 3 and row.reused == 2
+    assert [r.reused for r in rows] == [True, True, False] and "2 reused" in row.rows()
+    again, _ = evaluate_alignment(aligner, "validation", 3, store=ResultsStore(file))
+    assert aligner.calls == 3 and replace(again, reused=2) == row
+    for changes in ({"options": {"nodes": 32}}, {"weights_digest": "b"}):
+        other = _Fixed(np.eye(4))
+        other.__dict__.update(changes)
+        options = changes.get("options")
+        row, _ = evaluate_alignment(other, "validation", 1, options=options, store=store)
+        assert other.calls == 1 and row.reused == 0
 
 
 def test_the_oracle_answers_without_an_aligner() -> None:

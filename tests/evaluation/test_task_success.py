@@ -1,20 +1,23 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from scipy.stats import binomtest
 
+from iga_drake.evaluation.results import ResultsStore
 from iga_drake.evaluation.task_success import (
     EvaluationError,
     Trial,
     TrialResult,
     evaluate,
     format_table,
-    read_results,
     run_trial,
     summarise,
+    trial_key,
     wilson_interval,
 )
+from iga_drake.station.scenario import load_scenario
 
 
 @pytest.mark.parametrize("confidence", [0.8, 0.95, 0.99])
@@ -32,8 +35,12 @@ def test_wilson_interval_refuses_impossible_counts(bad):
         wilson_interval(*bad)
 
 
-def make_trials(seeds) -> list[tuple[str, Trial]]:
-    return [("grasp", Trial(scenario="grasp.yaml", aligner="icp", seed=seed)) for seed in seeds]
+def make_trials(seeds, **changes) -> list[Trial]:
+    fields = {
+        "task": "grasp", "scenario": "grasp", "arguments": ("grasp.yaml",), "aligner": "icp",
+        "key": {"scenario": "0123"},
+    }  # fmt: skip
+    return [Trial(seed=seed, **(fields | changes)) for seed in seeds]
 
 
 class FakeRun:
@@ -42,12 +49,12 @@ class FakeRun:
     def __init__(self) -> None:
         self.seeds: list[int] = []
 
-    def __call__(self, trial: Trial, *, task: str, split: str) -> TrialResult:
+    def __call__(self, trial: Trial) -> TrialResult:
         self.seeds.append(trial.seed)
         good = trial.seed >= 2
         return TrialResult(
-            task=task, scenario=Path(trial.scenario).stem, aligner=trial.aligner, seed=trial.seed,
-            split=split, success=good,
+            task=trial.task, scenario=trial.scenario, aligner=trial.aligner, seed=trial.seed,
+            split=trial.split, success=good,
             cause="" if good else "contact", reason="" if good else "slipped",
             position_error=0.01 * trial.seed,
         )  # fmt: skip
@@ -60,41 +67,42 @@ def test_results_keep_the_order_of_the_trials():
 
 def test_an_interrupted_evaluation_goes_on(tmp_path: Path):
     path = tmp_path / "new" / "results.jsonl"
-    evaluate(make_trials(range(3)), results_file=path, run=FakeRun())
-    with path.open("a") as file:
-        file.write('{"task": "grasp", "aligner": "icp", "se')  # power was cut here
+    first = evaluate(make_trials(range(3)), store=ResultsStore(path), run=FakeRun())
     run = FakeRun()
-    results = evaluate(make_trials(range(5)), results_file=path, run=run)
+    results = evaluate(make_trials(range(5)), store=ResultsStore(path), run=run)
     assert run.seeds == [3, 4]
-    assert results == read_results(path)
-    assert [json.loads(line)["seed"] for line in path.read_text().splitlines()] == list(range(5))
+    assert [result.reused for result in results] == [True] * 3 + [False] * 2
+    assert [replace(result, reused=False) for result in results[:3]] == first
+    assert "3 reused" in format_table(results) and "reused" not in format_table(first)
 
 
-def test_results_of_another_split_or_scenario_are_not_taken_over(tmp_path: Path):
-    path = tmp_path / "results.jsonl"
-    evaluate(make_trials([0]), results_file=path, run=FakeRun())
+def test_results_of_other_conditions_are_not_taken_over(tmp_path: Path):
+    store = ResultsStore(tmp_path / "results.jsonl")
+    evaluate(make_trials([0]), store=store, run=FakeRun())
     run = FakeRun()
-    evaluate(make_trials([0]), split="demonstration", results_file=path, run=run)
-    other = [("grasp", Trial(scenario="dark.yaml", aligner="icp", seed=0))]
-    results = evaluate(make_trials([0]) + other, results_file=path, run=run)
+    evaluate(make_trials([0], split="demonstration"), store=store, run=run)
+    results = evaluate(
+        make_trials([0]) + make_trials([0], key={"scenario": "4567"}, scenario="b/grasp"),
+        store=store,
+        run=run,
+    )
     assert run.seeds == [0, 0]
-    assert [row["scenario"] for row in summarise(results)] == ["grasp", "dark"]
-    assert len(read_results(path)) == 3
+    assert [row["scenario"] for row in summarise(results)] == ["grasp", "b/grasp"]
 
 
-def test_a_row_that_states_neither_is_of_the_tasks_own_scenario(tmp_path: Path):
-    path = tmp_path / "results.jsonl"
-    path.write_text('{"task": "grasp", "aligner": "icp", "seed": 4, "success": true}\n')
-    run = FakeRun()
-    (result,) = evaluate(make_trials([4]), results_file=path, run=run)
-    assert result.success and not run.seeds
+def test_trials_are_known_by_scenario_demonstrations_and_options(tmp_path: Path):
+    def scenario(*overrides: str):
+        return load_scenario("grasp", overrides=["aligner.name=icp", *overrides])
 
-
-def test_a_broken_line_in_the_middle_is_refused(tmp_path: Path):
-    path = tmp_path / "results.jsonl"
-    path.write_text("oops\n{}\n")
-    with pytest.raises(EvaluationError, match="line 1: not JSON"):
-        read_results(path)
+    there = f"demonstrations={tmp_path}"
+    keys = [
+        trial_key(scenario(*overrides))
+        for overrides in ((), ("aligner.options.starts=8",), ("aligner.name=expert",), (there,))
+    ]
+    assert keys[0] == trial_key(scenario())
+    assert len({json.dumps(key) for key in keys}) == len(keys)
+    (tmp_path / "manifest.json").touch()
+    assert trial_key(scenario(there)) != keys[3]
 
 
 def test_summary_counts_and_names_causes():
@@ -111,8 +119,8 @@ def test_summary_counts_and_names_causes():
 
 
 def test_a_process_that_breaks_is_a_failed_trial(tmp_path: Path):
-    trial = Trial(scenario=str(tmp_path / "missing.yaml"), aligner="icp", seed=0)
-    result = run_trial(trial, task="grasp", split="test")
+    (trial,) = make_trials([0], arguments=(str(tmp_path / "missing.yaml"),))
+    result = run_trial(trial)
     assert not result.success
     assert result.cause == "error"
     assert "exit status 2" in result.reason

@@ -15,6 +15,7 @@ from iga_drake.aligners.iga.voting import VotingConfig
 from iga_drake.aligners.iga.weights import DESCRIPTOR, ENERGY
 from iga_drake.checkpoint import load_checkpoint, save_checkpoint
 from iga_drake.dataset.samples import SampleConfig
+from iga_drake.evaluation.results import ResultsError
 from iga_drake.studies import ablations
 from iga_drake.studies.ablations import (
     VARIANTS,
@@ -178,7 +179,7 @@ def test_bad_requests_are_refused(tmp_path: Path, weights: dict[str, Path]) -> N
         with pytest.raises(AblationError, match=text):
             run(dataclasses.replace(there, **changes), "both")
     (tmp_path / "results.jsonl").write_text('{"a": 1}\n', encoding="utf-8")
-    with pytest.raises(AblationError, match=r"results\.jsonl, line 1: not a result"):
+    with pytest.raises(ResultsError, match=r"results\.jsonl, line 1: not a result"):
         run(there, "both")
 
 

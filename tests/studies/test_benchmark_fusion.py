@@ -1,10 +1,11 @@
 import json
 
-from iga_drake.studies.benchmark_fusion import main, table
+from iga_drake import cli
+from iga_drake.studies.benchmark_fusion import table
 
 
 def test_times_every_contender_in_one_run(capsys):
-    assert main(["--json", "--repetitions", "1"]) == 0
+    assert cli.main(["benchmark", "fusion", "--json", "--repetitions", "1"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert set(result) == {
         "ours, whole images",

@@ -2,8 +2,9 @@ import json
 
 import pytest
 
+from iga_drake import cli
 from iga_drake.errors import IgaDrakeError
-from iga_drake.studies.benchmark_ik import benchmark_ik, main
+from iga_drake.studies.benchmark_ik import benchmark_ik
 
 
 def test_random_poses_are_reached_and_no_limit_is_broken(capsys):
@@ -19,7 +20,7 @@ def test_random_poses_are_reached_and_no_limit_is_broken(capsys):
 def test_command_line_prints_json_and_repeats_itself(capsys):
     results = []
     for _ in range(2):
-        assert main(["--count", "1", "--seed", "2", "--json"]) == 0
+        assert cli.main(["benchmark", "ik", "--count", "1", "--seed", "2", "--json"]) == 0
         results.append(json.loads(capsys.readouterr().out))
     for name in ("reached", "steps", "simulated_seconds"):
         assert results[0][name] == results[1][name]

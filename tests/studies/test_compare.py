@@ -1,5 +1,6 @@
 """The comparison: operations, frames, the table and the figure."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from iga_drake.dataset.alignment_error import CONFIG, random_pose
 from iga_drake.dataset.loader import collate
 from iga_drake.dataset.samples import make_sample
 from iga_drake.errors import IgaDrakeError
+from iga_drake.evaluation.results import ResultsStore
 from iga_drake.geometry.se3 import rigid
 from iga_drake.studies.compare import Trained, compare, counted, in_common_frames, paper_flops
 from iga_drake.training.paper import nodes_of
@@ -71,6 +73,19 @@ def test_errors_are_those_of_the_poses() -> None:
         assert found.errors.translation_mean == pytest.approx(1.0, abs=1e-3)
         assert found.errors.rotation_mean < 0.01
         assert found.inference_seconds < 0.1 and "knowing" in found.row()
+
+
+def test_errors_are_stored_and_reused(tmp_path: Path) -> None:
+    entry = Trained("knowing", "", _Knowing(), 100, 1e9, 60.0)
+    first = compare(entry, "easy", 2, store=ResultsStore(tmp_path / "results.jsonl"))
+    store = ResultsStore(tmp_path / "results.jsonl")
+    again = compare(entry, "easy", 2, store=store)
+    assert (first.reused, again.reused) == (0, 2) and again.errors == first.errors
+    assert again.row().endswith("2 reused")
+    other = dataclasses.replace(entry, options={"steps": 2})
+    assert compare(other, "easy", 2, store=store).reused == 0
+    assert compare(entry, "easy", 2, store=store, frames="common").reused == 0
+    assert compare(entry, "easy", 2, store=store, cloud_points=100).reused == 0
 
 
 def test_common_frames_leave_the_test_pair_alone() -> None:
@@ -132,8 +147,8 @@ def test_table_and_figure(tmp_path: Path, capsys) -> None:
     assert cli.main(["evaluate", "compare", *nowhere]) == cli.BAD_INPUT
     captured = capsys.readouterr()
     assert "no weights of part 'dfm'" in captured.err
-    assert cli.main(["evaluate", "compare", "--aligners", "icp"]) == cli.BAD_INPUT
-    assert "iga, iga-energy, iga-paper, dirreg, dfm" in capsys.readouterr().err
+    assert cli.main(["evaluate", "compare", "--aligners", "oracle"]) == cli.BAD_INPUT
+    assert "one of: dfm, dirreg, icp, iga, iga-energy, iga-paper" in capsys.readouterr().err
     assert cli.main([*options[:8], "--aligners", "dirreg", "--weights", f"dfm={folder}"]) == 2
     assert "--weights dfm" in capsys.readouterr().err
 

@@ -7,7 +7,7 @@ from scipy.stats import mannwhitneyu
 
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.errors import IgaDrakeError
-from iga_drake.studies.familiarity import Familiarity, main
+from iga_drake.studies.familiarity import Familiarity, run
 
 
 class Asked:
@@ -27,11 +27,11 @@ def _arguments(**changes) -> argparse.Namespace:
 
 
 def test_own_and_foreign_contexts_are_asked_in_turn(capsys) -> None:
-    assert main(_arguments(), Asked(0.9, 0.2, 0.4, 0.6)) == 0
+    assert run(_arguments(), Asked(0.9, 0.2, 0.4, 0.6)) == 0
     (found,) = json.loads(capsys.readouterr().out)
     assert found["own"] == [0.9, 0.4] and found["foreign"] == [0.2, 0.6]
     assert found["area"] == pytest.approx(0.75)
-    assert main(_arguments(json=False), Asked(0.9, 0.2, 0.4, 0.6)) == 0
+    assert run(_arguments(json=False), Asked(0.9, 0.2, 0.4, 0.6)) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["0.5", "50.0", "50.0", "0.0", "100.0", "nan"] in rows
 
@@ -45,8 +45,8 @@ def test_the_area_is_the_statistic_of_mann_and_whitney() -> None:
 
 def test_an_aligner_that_cannot_tell_is_refused() -> None:
     with pytest.raises(IgaDrakeError, match="asked: gives no familiarity"):
-        main(_arguments(), Asked(None))
+        run(_arguments(), Asked(None))
     with pytest.raises(IgaDrakeError, match="--count 0"):
-        main(_arguments(count=0), Asked())
+        run(_arguments(count=0), Asked())
     with pytest.raises(IgaDrakeError, match="'nowhere' is not known"):
-        main(_arguments(sets="nowhere"), Asked())
+        run(_arguments(sets="nowhere"), Asked())

@@ -29,7 +29,7 @@ def write_settings(folder: Path, **training) -> Path:
 
 def command(*options: object, launcher: tuple[str, ...] = ()) -> subprocess.Popen:
     """`iga train descriptor` in a process of its own."""
-    start = (*launcher, "-m", "iga_drake.training.cli", "descriptor", "--device", "cpu")
+    start = (*launcher, "-m", "iga_drake.cli", "train", "descriptor", "--device", "cpu")
     return subprocess.Popen(
         [sys.executable, *start, *map(str, options)],
         env=os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""},

@@ -1,6 +1,5 @@
 """Training of the DIF-Net: signed distances, losses, learning, and going on after a stop."""
 
-import argparse
 import json
 from pathlib import Path
 
@@ -9,11 +8,12 @@ import pytest
 import torch
 import trimesh
 
+from iga_drake import cli
 from iga_drake.checkpoint import CheckpointError, load_checkpoint
 from iga_drake.shapes.dif_net import DifNet, DifNetConfig, Normalisation, load_dif_net
 from iga_drake.shapes.instance import ShapeError
 from iga_drake.shapes.surfaces import ellipsoid
-from iga_drake.training import cli, dif_net
+from iga_drake.training import dif_net
 from iga_drake.training.dif_net import (
     DifNetTraining,
     dif_net_loss,
@@ -168,10 +168,8 @@ def test_an_unknown_family_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_command_trains(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    parser = argparse.ArgumentParser()
-    cli.add_arguments(parser)
     options = "--steps 2 --shapes 4 --batch 2 --points 16 --device cpu".split()
-    assert cli.main(parser.parse_args(["dif-net", "--out", str(tmp_path), *options])) == 0
+    assert cli.main(["train", "dif-net", "--out", str(tmp_path), *options]) == 0
     assert capsys.readouterr().out.startswith("step 2, 64 points seen")
     net, card = load_dif_net(tmp_path / "dif_net.safetensors")
     assert len(net.latents) == 4 and card["training"]["family"] == "chair"

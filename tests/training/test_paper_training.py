@@ -10,7 +10,7 @@ import torch
 import yaml
 from paper_networks import CHANNELS, SMALL, nodes
 
-from iga_drake import precision
+from iga_drake import cli, precision
 from iga_drake.aligners.iga.local_encoder import EncoderConfig, LocalEncoder, OccupancyNet
 from iga_drake.aligners.iga_paper.graph import Nodes, moved
 from iga_drake.aligners.iga_paper.model import PaperModel, load_model
@@ -20,7 +20,7 @@ from iga_drake.dataset.loader import collate
 from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.geometry.se3 import geodesic_angle, random_rotations, rigid, so3_exp
 from iga_drake.paths import models_dir
-from iga_drake.training import cli, paper
+from iga_drake.training import paper
 from iga_drake.training.paper import (
     NodeStream,
     PaperSettings,
@@ -380,12 +380,13 @@ def test_validation_chooses_a_checkpoint_and_options_say_no(
         "samples": {"cloud_points": 64, "surface_points": 400, "least_seen": 8},
     }
     path.write_text(yaml.safe_dump(document))
-    options = ["paper", "--out", str(tmp_path / "run"), "--config", str(path), "--device", "cpu"]
+    options = ["train", "paper", "--out", str(tmp_path / "run"), "--config", str(path)]
+    options += ["--device", "cpu"]
     options += ["--encoder", str(encoder)]
     half = tmp_path / "half.safetensors"
     for part in ("rotation", "dfm"):
-        options[2] = str(tmp_path / part)
-        assert cli.run([*options, "--part", part, "--half", str(half)]) == 0
+        options[3] = str(tmp_path / part)
+        assert cli.main([*options, "--part", part, "--half", str(half)]) == 0
         out = capsys.readouterr().out
         assert f"{part}: step 2, 4 samples seen" in out and "best validation" in out
         model, card = load_model(half, part)
@@ -396,7 +397,7 @@ def test_validation_chooses_a_checkpoint_and_options_say_no(
         for a, b in zip(model.parameters(), whole.parameters(), strict=True):
             torch.testing.assert_close(a, b, atol=2e-3, rtol=2e-3)
         assert card["step"] in (1, 2)
-    assert cli.run([*options, "--part", "dfm", "--candidates", "0"]) == 2
+    assert cli.main([*options, "--part", "dfm", "--candidates", "0"]) == 2
     assert "candidates = 0" in capsys.readouterr().err
     assert PaperSettings.of(tmp_path / "dfm", "dfm").training.steps == 2
 

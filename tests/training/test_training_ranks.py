@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from descriptor_runs import command, log, state, write_settings
 
-from iga_drake.training import cli
+from iga_drake import cli
 
 TORCHRUN = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
 
@@ -17,7 +17,7 @@ def test_two_processes_average_to_the_gradients_of_one(tmp_path: Path, monkeypat
         "--config", settings, "--out", tmp_path / "two", "--batch", 2, launcher=TORCHRUN
     )
     one = ["--out", str(tmp_path / "one"), "--config", str(settings), "--batch", "4"]
-    assert cli.run(["descriptor", *one, "--device", "cpu"]) == 0
+    assert cli.main(["train", "descriptor", *one, "--device", "cpu"]) == 0
     out, _ = together.communicate()
     assert together.returncode == 0, out
     assert out.count("8 samples seen") == 1  # one of them reports
@@ -37,5 +37,5 @@ def test_two_processes_average_to_the_gradients_of_one(tmp_path: Path, monkeypat
 def test_a_network_that_trains_alone_refuses_company(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setenv("RANK", "0")
     monkeypatch.setenv("WORLD_SIZE", "2")
-    assert cli.run(["dif-net", "--out", str(tmp_path)]) == 2
+    assert cli.main(["train", "dif-net", "--out", str(tmp_path)]) == 2
     assert "trains in one process" in capsys.readouterr().err

@@ -14,8 +14,8 @@ from descriptor_runs import assert_same, command, log, state, write_settings
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor, nn
 
+from iga_drake import cli
 from iga_drake.checkpoint import load_checkpoint
-from iga_drake.training import cli
 from iga_drake.training import run as training_run
 from iga_drake.training.run import (
     RunConfig,
@@ -167,7 +167,7 @@ def test_a_run_killed_at_any_moment_ends_as_if_it_had_not_been(tmp_path: Path) -
         tmp_path, steps=7, log_every=2, validate_every=5, validation_samples=1
     )
     options = ("--config", settings, "--checkpoint-every", 3)
-    assert cli.run(["descriptor", "--out", str(tmp_path / "whole"), *map(str, options)]) == 0
+    assert cli.main(["train", "descriptor", "--out", f"{tmp_path}/whole", *map(str, options)]) == 0
     killed = tmp_path / "killed"
     process = command("--out", killed, *options)
     # Past the first checkpoint, and past what it holds of the log.

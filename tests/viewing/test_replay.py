@@ -9,6 +9,7 @@ from iga_drake.viewing.replay import (
     demonstrations_html,
     quiet_meshcat,
     show_cloud,
+    show_demonstrations,
     show_prediction,
     write_html,
 )
@@ -44,5 +45,9 @@ def test_an_empty_cloud_removes_the_old_one():
 
 
 def test_page_of_demonstrations():
+    meshcat = quiet_meshcat()
+    show_demonstrations(meshcat, make_set())
+    for path in ("0/grasp/X_WE", "1/place/goal", "1/place/thing in the hand", "0/trajectory of E"):
+        assert meshcat.HasPath(f"/drake/demonstrations/{path}")
     text = demonstrations_html(make_set())
     assert text.lstrip().lower().startswith("<!doctype html>")

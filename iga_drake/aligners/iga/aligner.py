@@ -18,6 +18,7 @@ from iga_drake.aligners.iga.descriptor import DescriptorNet
 from iga_drake.aligners.iga.energy import PairEnergyNet, SearchConfig, minimise, pair_proposals
 from iga_drake.aligners.iga.voting import Match, VotingConfig, cast_votes, match_objects, modes
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate
+from iga_drake.checkpoint import file_digest, network_digest
 from iga_drake.demonstrations.alignment import Alignment, check_cloud
 from iga_drake.geometry.clouds import furthest_point_sampling
 from iga_drake.geometry.se3 import rigid
@@ -97,10 +98,20 @@ class IgaAligner:
         """
         from iga_drake.aligners.iga.weights import load_descriptor, load_energy
 
+        digests = []
         if net is None:
-            net, _ = load_descriptor(Path(weights) if weights else default_weights())
+            path = Path(weights) if weights else default_weights()
+            net, _ = load_descriptor(path)
+            digests.append(file_digest(path))
+        else:
+            digests.append(network_digest(net))
         if isinstance(energy, (str, Path)):
-            energy, _ = load_energy(default_energy() if energy == LANDED else Path(energy))
+            path = default_energy() if energy == LANDED else Path(energy)
+            energy, _ = load_energy(path)
+            digests.append(file_digest(path))
+        elif energy is not None:
+            digests.append(network_digest(energy))
+        self.weights_digest = "+".join(digests)
         self._energy = copy.deepcopy(energy).eval().double() if energy is not None else None
         # Double precision where it counts: choices between near ties must not depend on the clouds'
         # frames.

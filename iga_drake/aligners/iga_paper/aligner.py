@@ -13,6 +13,7 @@ from iga_drake.aligners.iga_paper.model import PaperModel, kind_of, load_model
 from iga_drake.aligners.iga_paper.nodes import Problem, problem
 from iga_drake.aligners.iga_paper.search import best, search_rotation, search_translation
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate
+from iga_drake.checkpoint import file_digest, network_digest
 from iga_drake.demonstrations.alignment import Alignment, check_cloud
 from iga_drake.geometry.se3 import geodesic_angle
 from iga_drake.paths import models_dir
@@ -52,10 +53,11 @@ def found_path(part: str, path: Path | str | None, name: str) -> Path:
     )
 
 
-def found_model(part: str, path: Path | str | None, name: str) -> PaperModel:
-    """The model of `found_path`. Raises `AlignerError`, and `CheckpointError` where it is a foreign
-    one."""
-    return load_model(found_path(part, path, name), part)[0]
+def found_model(part: str, path: Path | str | None, name: str) -> tuple[PaperModel, str]:
+    """The model of `found_path` and its file's digest. Raises `AlignerError`, and `CheckpointError`
+    where it is a foreign one."""
+    found = found_path(part, path, name)
+    return load_model(found, part)[0], file_digest(found)
 
 
 def _drawn(cloud: np.ndarray, count: int, seed: int) -> Tensor:
@@ -160,11 +162,14 @@ class IgaPaperAligner:
         """
         if models is None:
             paths = (rotation or weights, translation or weights)
-            models = [
+            found = [
                 found_model(part, path, self.name)
                 for part, path in zip(("rotation", "translation"), paths, strict=True)
             ]
-        self.rotation, self.translation = models
+        else:
+            found = [(model, network_digest(model)) for model in models]
+        (self.rotation, first), (self.translation, second) = found
+        self.weights_digest = f"{first}+{second}"
         self.config = config or IgaPaperConfig()
 
     @torch.no_grad()

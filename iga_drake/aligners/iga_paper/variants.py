@@ -12,6 +12,7 @@ from iga_drake.aligners.iga_paper.langevin import LangevinConfig, haar_rotations
 from iga_drake.aligners.iga_paper.model import PaperModel
 from iga_drake.aligners.iga_paper.search import correction_of, search_distance
 from iga_drake.aligners.protocol import PoseEstimate
+from iga_drake.checkpoint import network_digest
 from iga_drake.demonstrations.alignment import Alignment
 
 
@@ -39,7 +40,10 @@ class DirRegAligner:
 
         Raises `AlignerError` where there is none, `CheckpointError` for a foreign file.
         """
-        self.model = model or found_model("dirreg", weights, self.name)
+        if model is None:
+            self.model, self.weights_digest = found_model("dirreg", weights, self.name)
+        else:
+            self.model, self.weights_digest = model, network_digest(model)
         self.config = config or DirRegConfig()
 
     @torch.no_grad()
@@ -96,7 +100,10 @@ class DfmAligner:
 
         Raises `AlignerError` where there is none, `CheckpointError` for a foreign file.
         """
-        self.model = model or found_model("dfm", weights, self.name)
+        if model is None:
+            self.model, self.weights_digest = found_model("dfm", weights, self.name)
+        else:
+            self.model, self.weights_digest = model, network_digest(model)
         self.config = config or DfmConfig()
 
     @torch.no_grad()

@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     read.add_argument("--count", type=int, help="read the first ones only")
 
 
-def main(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Runs `iga shapes`; returns the exit status. Raises `ShapeError` for bad input."""
     return {"list": _list, "sdf": _sdf, "read": _read}[arguments.kind](arguments)
 

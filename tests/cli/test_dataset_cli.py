@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from iga_drake.dataset import cli
+from iga_drake.cli import dataset
 from iga_drake.dataset.export import digest, read_shard, set_digest
 from iga_drake.dataset.samples import make_sample
 from iga_drake.errors import IgaDrakeError
@@ -14,8 +14,8 @@ from iga_drake.errors import IgaDrakeError
 
 def run(*arguments: str) -> int:
     parser = argparse.ArgumentParser()
-    cli.add_arguments(parser)
-    return cli.main(parser.parse_args(arguments))
+    dataset.add_arguments(parser)
+    return dataset.run(parser.parse_args(arguments))
 
 
 def test_export_writes_the_set_s_samples_and_resumes(
@@ -43,8 +43,8 @@ def test_digest_prints_the_set_s_digest(capsys: pytest.CaptureFixture) -> None:
 
 def test_all_of_a_set_unless_told_otherwise() -> None:
     parser = argparse.ArgumentParser()
-    cli.add_arguments(parser)
-    assert cli._count(parser.parse_args(["digest", "--set", "easy"])) == 1000
+    dataset.add_arguments(parser)
+    assert dataset._count(parser.parse_args(["digest", "--set", "easy"])) == 1000
 
 
 @pytest.mark.parametrize(

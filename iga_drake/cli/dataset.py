@@ -4,11 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from iga_drake.errors import IgaDrakeError
-
-
-class DatasetCommandError(IgaDrakeError):
-    """A dataset command was asked for something that it can't do."""
+from iga_drake.cli.status import CommandError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +33,7 @@ def _add_set(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def main(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Runs `iga dataset`; returns the exit status. Raises `IgaDrakeError` for bad input."""
     return {"export": _export, "digest": _digest}[arguments.kind](arguments)
 
@@ -49,10 +45,10 @@ def _count(arguments: argparse.Namespace) -> int:
     size = sample_set(arguments.split).count
     count = size if arguments.count is None else arguments.count
     if count is None:
-        raise DatasetCommandError(f"--count: needed, the set '{arguments.split}' has no end")
+        raise CommandError(f"--count: needed, the set '{arguments.split}' has no end")
     if count < 1 or (size is not None and count > size):
         most = "or more" if size is None else f"to {size}"
-        raise DatasetCommandError(f"--count {count}: 1 {most} samples of '{arguments.split}'")
+        raise CommandError(f"--count {count}: 1 {most} samples of '{arguments.split}'")
     return count
 
 
@@ -85,7 +81,7 @@ def _export(arguments: argparse.Namespace) -> int:
 def _digest(arguments: argparse.Namespace) -> int:
     count = _count(arguments)
     if arguments.workers < 0:
-        raise DatasetCommandError(f"--workers {arguments.workers}: 0 or more are needed")
+        raise CommandError(f"--workers {arguments.workers}: 0 or more are needed")
     from iga_drake.dataset.export import set_digest
     from iga_drake.dataset.samples import SampleConfig
 

@@ -49,7 +49,7 @@ def settings_of(arguments: argparse.Namespace) -> PaperSettings:
     return with_options(settings, arguments, FIELDS)
 
 
-def main(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Runs the training; a run that was stopped (or killed) goes on from its last checkpoint."""
     torch.set_num_threads(arguments.threads)
     torch.set_flush_denormal(True)

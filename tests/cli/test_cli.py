@@ -1,15 +1,21 @@
 """The `iga` command: exit statuses and one-line errors."""
 
+import argparse
 import json
+import subprocess
+import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from demonstration_fakes import make_set
 
 from iga_drake import cli
-from iga_drake.demonstrations.demonstration import write_demonstrations
+from iga_drake.cli import shapes
+from iga_drake.cli.options import add_aligner_options, aligner_options
+from iga_drake.cli.status import CommandError
+from iga_drake.demonstrations.store import write_demonstrations
 from iga_drake.paths import diagrams_dir
+from iga_drake.tasks.registry import make_task
 
 
 def refused(capsys: pytest.CaptureFixture, *arguments: str) -> str:
@@ -49,6 +55,55 @@ def scenario_with(tmp_path: Path, demonstrations: Path) -> str:
     return str(path)
 
 
+def test_aligners_are_checked_first(capsys):
+    assert "unknown aligner 'oracle'" in refused(capsys, "simulate", "grasp", "--aligner", "oracle")
+    line = refused(capsys, "simulate", "grasp", "--aligner", "icp", "--option", "speed=3")
+    assert "{'speed': 3}: 'icp' does not take them" in line
+    line = refused(capsys, "simulate", "grasp", "--aligner", "icp", "--option", "iga.speed=3")
+    assert "'iga' is not among the aligners asked for: icp" in line
+    line = refused(capsys, "simulate", "grasp", "--aligner", "icp", "--option", "starts=null")
+    assert "a number or text is expected" in line
+    line = refused(capsys, "simulate", "grasp", "--aligner", "expert", "--option", "speed=3")
+    assert "the expert takes none" in line
+
+
+def test_a_bug_does_not_look_like_bad_input(capsys, monkeypatch):
+    def broken(arguments):
+        raise RuntimeError("a bug\nin two lines")
+
+    monkeypatch.setattr(shapes, "run", broken)
+    assert cli.main(["shapes", "list"]) == cli.INTERNAL == 3
+    error = capsys.readouterr().err
+    assert "Traceback" in error and "in broken" in error
+    assert error.endswith("iga shapes: internal error: RuntimeError: a bug in two lines\n")
+
+
+def test_help_is_quick():
+    """No heavy import before a command is asked for."""
+    code = (
+        "import sys\n"
+        "from iga_drake.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'torch', 'open3d', 'numpy', 'pydrake'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "demonstrate" in done.stdout and "train" in done.stdout
+
+
+def test_options_of_aligners():
+    parser = argparse.ArgumentParser()
+    add_aligner_options(parser)
+    given = ["--option", "starts=8", "--option", "iga.energy=null", "--option", "iga.starts=a=b"]
+    found = aligner_options(parser.parse_args(given), ["iga", "icp"])
+    assert found == {"iga": {"starts": "a=b", "energy": None}, "icp": {"starts": 8}}
+    for bad in ("starts", "=8", ".starts=8", "iga.=8", "a b=8"):
+        with pytest.raises(CommandError, match="NAME=VALUE is expected"):
+            aligner_options(parser.parse_args(["--option", bad]), ["iga"])
+
+
 def test_missing_demonstrations(capsys, tmp_path: Path):
     scenario = scenario_with(tmp_path, tmp_path / "none")
     assert "manifest.json" in refused(capsys, "simulate", scenario, "--aligner", "icp")
@@ -81,11 +136,15 @@ def test_view_writes_a_page(capsys, tmp_path: Path):
     arguments = ("view", "demonstrations", str(tmp_path / "demos"), "--html", str(page))
     assert cli.main(arguments) == cli.SUCCESS
     assert page.read_text().lstrip().lower().startswith("<!doctype html>")
-    assert "40 grasped points, 60 target points" in capsys.readouterr().out
+    assert (
+        "thing in the hand 80 points, goal 80 points; waypoints grasp, place"
+        in capsys.readouterr().out
+    )
 
 
 def test_evaluate_refuses_what_it_does_not_know(capsys):
-    assert "oracle: unknown" in refused(capsys, "evaluate", "tasks", "--aligner", "oracle")
+    line = refused(capsys, "evaluate", "tasks", "--aligner", "oracle")
+    assert "unknown aligner 'oracle': one of: " in line and "iga-paper" in line
     assert "juggle: no such file" in refused(capsys, "evaluate", "tasks", "--tasks", "juggle")
     assert "at least 1" in refused(capsys, "evaluate", "tasks", "--trials", "0")
     assert "--tasks: empty" in refused(capsys, "evaluate", "tasks", "--tasks", ",")
@@ -114,7 +173,7 @@ def test_a_file_where_a_folder_should_be(capsys, tmp_path: Path):
 
 @pytest.mark.parametrize(
     "arguments",
-    [["simulate"], ["simulate", "grasp", "--aligner", "oracle"], ["fly"], []]
+    [["simulate"], ["fly"], ["simulate", "grasp", "--fly"], ["evaluate", "flight"], []]
     + [["simulate", "grasp", "--seed", seed] for seed in ("-1", "three")],
 )
 def test_bad_usage_has_exit_status_2(arguments: list[str]):
@@ -123,22 +182,39 @@ def test_bad_usage_has_exit_status_2(arguments: list[str]):
     assert exit_info.value.code == 2
 
 
-def test_scenarios_can_be_named():
-    assert cli.scenario_path("stack") == diagrams_dir() / "stack.yaml"
-    assert cli.scenario_path("stack.yaml") == diagrams_dir() / "stack.yaml"
+def test_values_of_a_scenario_can_be_set(capsys, tmp_path: Path):
+    overlay = tmp_path / "overlay.yaml"
+    overlay.write_text("task: {name: juggle}\n")
+    for command in (("simulate", "grasp"), ("demonstrate", "grasp", "--out", str(tmp_path / "o"))):
+        line = refused(capsys, *command, "--set", "task.name=walk")
+        assert "unknown task 'walk'" in line
+        assert "unknown task 'juggle'" in refused(capsys, *command, "--with", str(overlay))
+        assert "goal" in refused(capsys, *command, "--set", "task.goal=tea")
 
 
 def test_exit_status_follows_the_verdict(monkeypatch, tmp_path: Path):
     from iga_drake.tasks import episode
 
-    def fake(scenario, *, seed, aligner, split, meshcat, on_event):
-        return episode.EpisodeResult(
-            task="grasp", aligner="icp", seed=seed, split=split, success=seed == 1,
-            target_points=np.zeros((0, 3)),
-        )  # fmt: skip
+    class FakeEpisode:
+        def __init__(self, scenario, *, seed, split, meshcat):
+            self.task, self.seed, self.split = make_task(scenario.task.name), seed, split
+            assert scenario.aligner.name == "icp"
 
-    monkeypatch.setattr(episode, "run_episode", fake)
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def run(self, on_event):
+            return episode.EpisodeResult(
+                task="grasp", aligner="icp", seed=self.seed, split=self.split, scenario="",
+                success=self.seed == 1,
+            )  # fmt: skip
+
+    monkeypatch.setattr(episode, "Episode", FakeEpisode)
     path = tmp_path / "result.json"
-    assert cli.main(["simulate", "grasp", "--seed", "1", "--result", str(path)]) == cli.SUCCESS
+    command = ["simulate", "grasp", "--aligner", "icp", "--result", str(path)]
+    assert cli.main([*command, "--seed", "1"]) == cli.SUCCESS
     assert json.loads(path.read_text())["success"] is True
-    assert cli.main(["simulate", "grasp", "--seed", "2"]) == cli.FAILURE
+    assert cli.main([*command, "--seed", "2"]) == cli.FAILURE

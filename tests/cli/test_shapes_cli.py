@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from iga_drake.shapes import cli
+from iga_drake.cli import shapes
 from iga_drake.shapes.families import FAMILIES
 from iga_drake.shapes.instance import ShapeError
 
 
 def run(*arguments: str) -> int:
     parser = argparse.ArgumentParser()
-    cli.add_arguments(parser)
-    return cli.main(parser.parse_args(arguments))
+    shapes.add_arguments(parser)
+    return shapes.run(parser.parse_args(arguments))
 
 
 def test_list_names_every_family(capsys: pytest.CaptureFixture) -> None:

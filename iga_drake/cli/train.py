@@ -1,18 +1,16 @@
 """`iga train`: trains the networks of the learned aligner; resumes where it was stopped.
 
 Several processes train together under torchrun:
-`torchrun --nproc-per-node 2 -m iga_drake.training.cli descriptor --out DIR`.
+`torchrun --nproc-per-node 2 -m iga_drake.cli train descriptor --out DIR`.
 """
 
 import argparse
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
-from iga_drake.errors import IgaDrakeError
-from iga_drake.training import dif_net, encoder, paper_cli
+from iga_drake.cli import train_paper
+from iga_drake.training import dif_net, encoder
 from iga_drake.training.descriptor import DescriptorSettings, train_descriptor
 from iga_drake.training.energy import EnergySettings, train_energy
 from iga_drake.training.options import add_run_options, run_options, with_options
@@ -28,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_descriptor(networks.add_parser("descriptor", help="dense descriptors of the iga aligner"))
     _add_energy(networks.add_parser("energy", help="energy of the iga aligner: ranks poses"))
     encoder.add_arguments(networks.add_parser("encoder", help="local encoder, by occupancy"))
-    paper_cli.add_arguments(networks.add_parser("paper", help="the paper's networks and variants"))
+    train_paper.add_arguments(networks.add_parser("paper", help="the paper's networks"))
     dif_net.add_arguments(networks.add_parser("dif-net", help="deformed implicit field of chairs"))
 
 
@@ -74,7 +72,7 @@ def _train_energy(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def main(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Runs the training; a run that was stopped (or killed) goes on from its last checkpoint."""
     if arguments.network in ALONE:
         if launched() > 1:
@@ -85,7 +83,7 @@ def main(arguments: argparse.Namespace) -> int:
     torch.set_num_threads(arguments.threads)
     torch.set_flush_denormal(True)
     if arguments.network == "paper":
-        return paper_cli.main(arguments)
+        return train_paper.run(arguments)
     if arguments.network == "energy":
         return _train_energy(arguments)
     settings: DescriptorSettings = with_options(DescriptorSettings.of(arguments.out), arguments)
@@ -115,18 +113,3 @@ def main(arguments: argparse.Namespace) -> int:
                 f"{errors['step']}"
             )
     return 0
-
-
-def run(options: Sequence[str] | None = None) -> int:
-    """`iga train` as a module, for torchrun."""
-    parser = argparse.ArgumentParser(prog="iga train", description=__doc__)
-    add_arguments(parser)
-    try:
-        return main(parser.parse_args(options))
-    except IgaDrakeError as error:
-        print(f"iga train: {error}", file=sys.stderr)
-        return 2
-
-
-if __name__ == "__main__":
-    sys.exit(run())

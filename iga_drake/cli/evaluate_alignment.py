@@ -1,0 +1,73 @@
+"""Pose error on generated samples."""
+
+import argparse
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+from iga_drake.aligners.registry import ORACLE, make_aligner
+from iga_drake.cli.options import add_aligner_options, aligner_options, names
+from iga_drake.files import write_text
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `iga evaluate alignment`."""
+    parser.add_argument(
+        "--aligner", type=names, default=["iga", "icp", ORACLE], help="names, or oracle"
+    )
+    add_aligner_options(parser)
+    parser.add_argument("--sets", type=names, help="of samples (default: the paper's five)")
+    parser.add_argument("--count", type=int, default=100, help="samples of each set")
+    parser.add_argument("--results", type=Path, help="results file to append to and go on from")
+    parser.add_argument("--by-category", action="store_true", help="also by kind of object")
+    parser.add_argument("--weights", help="short for --option weights=FILE")
+    parser.add_argument("--energy", help="short for --option energy=FILE")
+    parser.add_argument("--card", type=Path, help="write a model card of iga's weights")
+    parser.add_argument("--energy-card", type=Path, help="write one of its energy")
+    parser.add_argument("--json", action="store_true", help="print the errors as JSON")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Prints two rows for each aligner and set."""
+    from iga_drake.evaluation.alignment import FIVE_SETS, HEADER, by_category, evaluate_alignment
+    from iga_drake.evaluation.results import ResultsStore
+
+    short = {name: getattr(arguments, name) for name in ("weights", "energy")}
+    given = {name: path for name, path in short.items() if path is not None}
+    asked = [name for name in arguments.aligner if name != ORACLE]
+    options = {name: given | own for name, own in aligner_options(arguments, asked).items()}
+    aligners = {name: make_aligner(name, **own) for name, own in options.items()}
+    store = ResultsStore(arguments.results) if arguments.results else None
+    summaries = []
+    if not arguments.json:
+        print(HEADER)
+    for name in arguments.aligner:
+        rows = []
+        for chosen in arguments.sets or FIVE_SETS:
+            summary, found = evaluate_alignment(
+                aligners.get(name), chosen, arguments.count, options=options.get(name), store=store
+            )
+            summaries.append(summary)
+            rows += found
+            if not arguments.json:
+                print(summary.rows(), flush=True)
+        if arguments.by_category and not arguments.json:
+            print(by_category(rows))
+    if arguments.json:
+        print(json.dumps([asdict(summary) for summary in summaries], indent=2))
+    _write_cards(arguments, summaries)
+
+
+def _write_cards(arguments: argparse.Namespace, summaries: list) -> None:
+    if not arguments.card and not arguments.energy_card:
+        return
+    from iga_drake.aligners.iga.aligner import default_energy, default_weights
+    from iga_drake.aligners.iga.weights import ENERGY
+    from iga_drake.evaluation.alignment import model_card
+
+    if arguments.card:
+        weights = Path(arguments.weights or default_weights())
+        write_text(arguments.card, model_card(weights, summaries))
+    if arguments.energy_card:
+        energy = Path(arguments.energy or default_energy())
+        write_text(arguments.energy_card, model_card(energy, summaries, kind=ENERGY))

@@ -1,0 +1,100 @@
+"""Success of whole episodes."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from iga_drake.aligners.registry import EXPERT
+from iga_drake.cli.options import add_aligner_options, aligner_options, names, seed
+from iga_drake.cli.scenarios import add_overlay_arguments, scenario_of, with_aligner
+from iga_drake.cli.status import CommandError
+
+if TYPE_CHECKING:
+    from iga_drake.evaluation.task_success import Trial, TrialResult
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `iga evaluate tasks`."""
+    parser.add_argument("--tasks", type=names, default=["grasp", "stack"], help="scenarios")
+    add_overlay_arguments(parser)
+    parser.add_argument("--trials", type=int, default=15)
+    parser.add_argument("--aligner", type=names, default=["iga", "icp"], help="names, or expert")
+    add_aligner_options(parser)
+    parser.add_argument("--seed", type=seed, default=0, help="seed of the first trial")
+    parser.add_argument("--split", choices=("test", "demonstration"), default="test")
+    parser.add_argument("--processes", type=int, default=1, help="episodes at a time")
+    parser.add_argument("--results", type=Path, help="results file to append to and to go on from")
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Runs the trials, tells each verdict, prints the table."""
+    from iga_drake.evaluation.results import ResultsStore
+    from iga_drake.evaluation.task_success import evaluate, format_table, summarise
+
+    if arguments.trials < 1:
+        raise CommandError(f"--trials {arguments.trials}: at least 1 is needed")
+    for option in ("tasks", "aligner"):
+        if not getattr(arguments, option):
+            raise CommandError(f"--{option}: empty, at least one name is needed")
+    store = ResultsStore(arguments.results) if arguments.results else None
+    results = evaluate(
+        _trials(arguments), processes=arguments.processes, store=store, on_result=_show
+    )
+    if arguments.json:
+        document = {"summary": summarise(results), "trials": [asdict(r) for r in results]}
+        print(json.dumps(document, indent=2))
+    else:
+        print(format_table(results))
+
+
+def _trials(arguments: argparse.Namespace) -> "list[Trial]":
+    """Of every scenario with every aligner; all that was asked for is checked."""
+    from iga_drake.evaluation.task_success import Trial, trial_key
+    from iga_drake.station.scenario import scenario_path
+
+    given = aligner_options(arguments, [name for name in arguments.aligner if name != EXPERT])
+    paths = [scenario_path(name) for name in arguments.tasks]
+    changes = [f"--with={overlay}" for overlay in arguments.overlays]
+    changes += [f"--set={override}" for override in arguments.overrides]
+    trials = []
+    for path, label in zip(paths, _labels(paths), strict=True):
+        scenario = scenario_of(arguments, str(path))
+        for aligner in arguments.aligner:
+            options = given.get(aligner, {})
+            chosen = with_aligner(scenario, aligner, options)
+            key = trial_key(chosen) if arguments.results else {}
+            own = [f"--option={name}={json.dumps(value)}" for name, value in options.items()]
+            trials += [
+                Trial(
+                    task=scenario.task.name,
+                    scenario=label,
+                    arguments=(str(path), *changes, *own),
+                    aligner=aligner,
+                    seed=number,
+                    split=arguments.split,
+                    key=key,
+                )
+                for number in range(arguments.seed, arguments.seed + arguments.trials)
+            ]
+    return trials
+
+
+def _labels(paths: Sequence[Path]) -> list[str]:
+    """Names of the files without their suffix; whole paths where two names are the same."""
+    stems = [path.stem for path in paths]
+    return [
+        path.stem if stems.count(path.stem) == 1 else str(path.with_suffix("")) for path in paths
+    ]
+
+
+def _show(result: "TrialResult") -> None:
+    verdict = "success" if result.success else f"failure ({result.cause}): {result.reason}"
+    reused = " (reused)" if result.reused else ""
+    print(
+        f"{result.scenario} {result.aligner} seed {result.seed}: {verdict}{reused}", file=sys.stderr
+    )

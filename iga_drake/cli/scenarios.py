@@ -1,0 +1,62 @@
+"""Options of every command that takes scenarios."""
+
+import argparse
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from iga_drake.cli.status import CommandError
+
+if TYPE_CHECKING:
+    from iga_drake.station.scenario import Scenario
+
+
+def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
+    """A scenario, files laid over it, and single values set in it."""
+    parser.add_argument("scenario", help="scenario YAML, e.g. diagrams/stack.yaml, or its name")
+    add_overlay_arguments(parser)
+
+
+def add_overlay_arguments(parser: argparse.ArgumentParser) -> None:
+    """What is changed in a scenario: further files, then single values."""
+    parser.add_argument(
+        "--with", dest="overlays", action="append", default=[], metavar="FILE",
+        help="further scenario file whose keys replace the scenario's; may be repeated",
+    )  # fmt: skip
+    parser.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
+        help="replaces one value, e.g. task.time_limit=30; may be repeated",
+    )  # fmt: skip
+
+
+def scenario_of(arguments: argparse.Namespace, scenario: str | None = None) -> "Scenario":
+    """The scenario (default: the argument's) with the arguments' files and values.
+
+    Raises `ScenarioError`.
+    """
+    from iga_drake.station.scenario import load_scenario
+
+    name = scenario or arguments.scenario
+    return load_scenario(name, *arguments.overlays, overrides=arguments.overrides)
+
+
+def with_aligner(scenario: "Scenario", name: str, options: Mapping[str, Any]) -> "Scenario":
+    """The scenario with the aligner `name`, or the expert, and these options; the scenario's own
+    stay where it is the scenario's aligner.
+
+    Raises `AlignerError` and `CommandError`.
+    """
+    from iga_drake.aligners.registry import EXPERT, check_aligner, make_aligner
+
+    if name != EXPERT:
+        check_aligner(name)
+    elif options:
+        raise CommandError(f"--option: the {EXPERT} takes none; leave it out")
+    for option, value in options.items():
+        if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+            raise CommandError(f"--option {option}={value}: a number or text is expected")
+    own = scenario.aligner.options if name == scenario.aligner.name else {}
+    if options:  # whether it takes them, before minutes of simulation
+        make_aligner(name, **{**own, **options})
+    chosen = dataclasses.replace(scenario.aligner, name=name, options={**own, **options})
+    return dataclasses.replace(scenario, aligner=chosen)
