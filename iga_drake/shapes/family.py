@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from iga_drake.shapes.instance import ShapeError, ShapeInstance
+from iga_drake.shapes.errors import ShapeError
+from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.surfaces import Surface, join
 from iga_drake.shapes.symmetry import NO_SYMMETRY, Symmetry
 
@@ -105,4 +106,5 @@ class Family:
             frames=draft.frames,
             convex_pieces=tuple(piece for part in draft.parts for piece in part.pieces()),
             density=self.density,
+            symmetry=self.symmetry,
         )

@@ -13,7 +13,7 @@ import trimesh
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 
 # Vertices nearer to each other than about this share of the mesh's extent are one.
 _MERGE = 1e-6

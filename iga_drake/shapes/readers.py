@@ -25,7 +25,7 @@ from typing import Literal
 import numpy as np
 import trimesh
 
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.mesh_cleaning import MeshCleaning, MeshError, clean_mesh, is_solid
 
 FORMATS = (".glb", ".gltf", ".obj", ".ply", ".stl")

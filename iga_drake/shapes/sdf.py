@@ -17,7 +17,8 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from iga_drake.shapes.instance import ShapeError, ShapeInstance
+from iga_drake.shapes.errors import ShapeError
+from iga_drake.shapes.instance import ShapeInstance
 
 _CREASE = np.radians(40.0)
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 
 
 class Surface(NamedTuple):

@@ -18,8 +18,8 @@ from iga_drake.shapes.deformers import LatticeDeformer, PartDeformer, Reinstanci
 from iga_drake.shapes.deformers.dif_net import DifNetDeformer, default_weights
 from iga_drake.shapes.deformers.protocol import DeformableShape, Deformer
 from iga_drake.shapes.dif_net import DifNet, Normalisation, load_dif_net
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.families import FAMILIES
-from iga_drake.shapes.instance import ShapeError
 from iga_drake.training.dif_net import DifNetTraining, training_shapes
 from iga_drake.viewing.shape_sheets import canonical_colors, contact_sheet, write_png
 

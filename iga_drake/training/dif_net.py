@@ -24,8 +24,8 @@ from iga_drake.shapes.dif_net import (
     Normalisation,
     siren_jacobian,
 )
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.families import FAMILIES
-from iga_drake.shapes.instance import ShapeError
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from iga_drake.shapes.deformers import (
     PartDeformer,
     ReinstancingDeformer,
 )
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.family import Draft, Family, Part
-from iga_drake.shapes.instance import ShapeError
 from iga_drake.shapes.surfaces import Surface, ellipsoid, join, rounded_box, transform
 
 

@@ -21,7 +21,7 @@ from iga_drake.shapes.dif_net import (
     siren,
     siren_jacobian,
 )
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.surfaces import ellipsoid, rounded_box
 
 SMALL = DifNetConfig(latent=8, width=16, hidden=2, template_width=16, template_hidden=2)

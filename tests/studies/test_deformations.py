@@ -9,7 +9,7 @@ import torch
 from iga_drake.shapes.deformers import LatticeDeformer
 from iga_drake.shapes.deformers.dif_net import DifNetDeformer
 from iga_drake.shapes.dif_net import DifNet, DifNetConfig
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.surfaces import ellipsoid, join, transform
 from iga_drake.studies.deformations import (
     correspondence_errors,

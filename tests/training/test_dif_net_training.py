@@ -11,7 +11,7 @@ import trimesh
 
 from iga_drake.checkpoint import CheckpointError, load_checkpoint
 from iga_drake.shapes.dif_net import DifNet, DifNetConfig, Normalisation, load_dif_net
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.surfaces import ellipsoid
 from iga_drake.training import cli, dif_net
 from iga_drake.training.dif_net import (

@@ -22,7 +22,7 @@ from iga_drake.shapes.dif_net import (
     siren,
     siren_jacobian,
 )
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 
 
 def default_weights() -> Path:

@@ -9,8 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.family import Draft
-from iga_drake.shapes.instance import ShapeError
 from iga_drake.shapes.surfaces import (
     Surface,
     loft,
