@@ -17,6 +17,7 @@ import torch
 from iga_drake.dataset.collections import collection_keys, collection_mesh
 from iga_drake.dataset.depth_camera import Clouds, DepthNoise, observe
 from iga_drake.dataset.splits import SampleSet, family_names, sample_set
+from iga_drake.geometry.rigid_fit import rigid_fit
 from iga_drake.shapes.composite import CompositeCategory
 from iga_drake.shapes.deformers import DeformableShape, Deformer, LatticeDeformer, PartDeformer
 from iga_drake.shapes.families import FAMILIES
@@ -240,7 +241,7 @@ def canonical_mesh(split: str, index: int, role: int) -> tuple[np.ndarray, np.nd
 def _carry_axis(axis: np.ndarray, rest: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     """An axis (2, 3) of `rest` (V, 3) where it best lies in the deformed `vertices` (V, 3)."""
     scale = np.sqrt(vertices.var(0).sum() / rest.var(0).sum())
-    R, p = _rigid_fit(scale * rest, vertices)
+    R, p = rigid_fit(scale * rest, vertices)
     return np.stack((scale * R @ axis[0] + p, R @ axis[1]))
 
 
@@ -294,22 +295,11 @@ class _Alignment:
             distance = np.linalg.norm(canonical - canonical[pick], axis=1)
             near = distance <= np.quantile(distance, config.neighbourhood)
             self.near.append(near)
-            self.poses.append(_rigid_fit(shape.points[1:, near], canonical[near]))
+            self.poses.append(rigid_fit(shape.points[1:, near], canonical[near]))
             picks.append(pick)
         R, p = _relative_pose(rng, objects, picks)
         RA, pA = self.poses[0]
         self.poses[0] = (R @ RA, pA @ R.T + p)
-
-
-def _rigid_fit(source: np.ndarray, destination: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R (..., 3, 3), p (..., 3) that carry source (..., n, 3) to destination (Kabsch 1976)."""
-    source_mean = source.mean(-2, keepdims=True)
-    mean = destination.mean(-2, keepdims=True)
-    U, _, Vt = np.linalg.svd(np.swapaxes(destination - mean, -1, -2) @ (source - source_mean))
-    flip = np.ones(U.shape[:-1])
-    flip[..., 2] = np.sign(np.linalg.det(U @ Vt))
-    R = (U * flip[..., None, :]) @ Vt
-    return R, (mean - source_mean @ np.swapaxes(R, -1, -2))[..., 0, :]
 
 
 def _rotation(rng: np.random.Generator) -> np.ndarray:

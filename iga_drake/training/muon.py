@@ -38,7 +38,10 @@ class Muon(torch.optim.Optimizer):
     """
 
     def __init__(self, params: Iterable[Any], lr: float, weight_decay: float):
-        """`params` are matrices or groups of them (dictionaries). Raises `ValueError`."""
+        """`params` are matrices, or groups of them as dictionaries.
+
+        Raises `ValueError` for a parameter that is no matrix.
+        """
         super().__init__(params, {"lr": lr, "weight_decay": weight_decay})
         for parameter in self._parameters():
             if parameter.ndim != 2:
