@@ -18,7 +18,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from iga_drake.dataset.depth_camera import DepthNoise, observe
+from iga_drake.dataset.depth_camera import observe
+from iga_drake.dataset.depth_noise import DepthNoise
 from iga_drake.dataset.samples import (
     SampleConfig,
     camera_positions,

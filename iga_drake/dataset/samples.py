@@ -15,7 +15,8 @@ import numpy as np
 import torch
 
 from iga_drake.dataset.collections import collection_keys, collection_mesh
-from iga_drake.dataset.depth_camera import Clouds, DepthNoise, observe
+from iga_drake.dataset.depth_camera import Clouds, observe
+from iga_drake.dataset.depth_noise import DepthNoise
 from iga_drake.dataset.splits import SampleSet, family_names, sample_set
 from iga_drake.geometry.rigid_fit import rigid_fit
 from iga_drake.shapes.composite import CompositeCategory

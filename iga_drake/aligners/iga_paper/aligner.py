@@ -14,7 +14,7 @@ from iga_drake.aligners.iga_paper.nodes import Problem, problem
 from iga_drake.aligners.iga_paper.search import best, search_rotation, search_translation
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate
 from iga_drake.demonstrations.alignment import Alignment, check_cloud
-from iga_drake.geometry.se3 import geodesic_angle
+from iga_drake.geometry.se3 import geodesic_angle, nearest_rotation
 from iga_drake.paths import models_dir
 
 DISTINCT_PLACE = 0.02  # m: particles nearer than this are one mode
@@ -110,8 +110,7 @@ class Asked:
         """X_WF (M, 4, 4) float64 in the frames given, from R (M, 3, 3), t (M, 3)."""
         X = np.tile(np.eye(4), (len(R), 1, 1))
         # Single precision leaves rotations a little off.
-        U, _, Vt = np.linalg.svd(R.double().numpy())
-        X[:, :3, :3] = U @ Vt
+        X[:, :3, :3] = nearest_rotation(R.double()).numpy()
         X[:, :3, 3] = t.double().numpy() + self.centres[1] - X[:, :3, :3] @ self.centres[0]
         return X
 
