@@ -108,30 +108,29 @@ def noisy_depth(
     if not valid.any():
         return depth.astype(np.float32)
     H, W = depth.shape
-    z = np.where(valid, depth, np.inf).astype(np.float64)
-    w = 1 / z
-    u = (np.arange(W) + 0.5 - W / 2) / focal
-    v = ((np.arange(H) + 0.5 - H / 2) / focal)[:, None]
-    near = np.where(valid, z, 0.0)
+    z = np.where(valid, depth, 0).astype(np.float32)
+    w = np.divide(1, z, out=np.zeros_like(z), where=valid)
+    u = ((np.arange(W, dtype=np.float32) + 0.5 - W / 2) / focal).astype(np.float32)
+    v = ((np.arange(H, dtype=np.float32) + 0.5 - H / 2) / focal).astype(np.float32)[:, None]
+    per_patch = z / np.float32(noise.patch)
     column, row = (
-        np.floor(coordinate * near / noise.patch).astype(int) & (_PATCHES - 1)
-        for coordinate in (u, v)
+        np.floor(coordinate * per_patch).astype(np.int32) & (_PATCHES - 1) for coordinate in (u, v)
     )
-    patches = rng.standard_normal((_PATCHES, _PATCHES))
-    error = noise.disparity * rng.standard_normal((H, W))
-    error += noise.patch_disparity * patches[row, column]
-    disparity = np.round((noise.focal_baseline * w + error) / noise.quantum) * noise.quantum
-    with np.errstate(divide="ignore"):
-        measured = noise.focal_baseline / disparity
+    patches = rng.standard_normal((_PATCHES, _PATCHES), dtype=np.float32)
+    disparity = noise.patch_disparity * patches.ravel()[row * _PATCHES + column]
+    disparity += noise.disparity * rng.standard_normal((H, W), dtype=np.float32)
+    disparity += noise.focal_baseline * w
+    disparity = np.round(disparity / noise.quantum) * noise.quantum
+    measured = noise.focal_baseline / np.where(valid, disparity, 1)
     share_kept = (_cosine(w, u, v, focal) - noise.grazing_lost) / _grazing_range(noise)
-    kept = rng.random((H, W)) < share_kept
+    kept = rng.random((H, W), dtype=np.float32) < share_kept
     reach = max(1, round(_EDGE_WIDTH * focal / float(np.median(z[valid]))))
     lowest = minimum_filter(w, size=2 * reach + 1, mode="nearest")
-    edge = lowest * (near + _EDGE_STEP) < 1  # something there is farther by a step
-    fate = rng.random((H, W))
-    kept &= ~edge | (fate >= noise.edge_lost)
-    flies = edge & (fate >= noise.edge_lost) & (fate < noise.edge_lost + noise.edge_flying)
-    measured += np.where(flies, noise.flying * rng.random((H, W)), 0)
+    edge = valid & (lowest * (z + _EDGE_STEP) < 1)  # something there is farther by a step
+    fate = rng.random(int(edge.sum()))
+    kept[edge] &= fate >= noise.edge_lost
+    flies = fate < noise.edge_lost + noise.edge_flying
+    measured[edge] += np.where(flies, noise.flying * rng.random(len(fate)), 0)
     return np.where(valid, np.where(kept, measured, LOST), depth).astype(np.float32)
 
 
@@ -146,8 +145,9 @@ def _cosine(w: np.ndarray, u: np.ndarray, v: np.ndarray, focal: float) -> np.nda
     v w_v). The slopes w_u and w_v are to the neighbour on the side where w changes less.
     """
     w_u, w_v = (focal * _lesser_difference(w, axis) for axis in (1, 0))
-    normal = np.sqrt(w_u**2 + w_v**2 + (w - u * w_u - v * w_v) ** 2)
-    return w / np.maximum(normal * np.sqrt(1 + u**2 + v**2), 1e-12)
+    along = w - u * w_u - v * w_v
+    squared = (w_u * w_u + w_v * w_v + along * along) * (1 + u * u + v * v)
+    return w / np.sqrt(np.maximum(squared, np.float32(1e-24)))
 
 
 def _lesser_difference(image: np.ndarray, axis: int) -> np.ndarray:
