@@ -125,7 +125,7 @@ def observe(
     if noise is not None:
         place, kept = _measure(place, cameras, view, images, source, noise, calibration, generator)
         place, source = place[kept], _Source(source.ray[kept], cameras.shape[1], O, P)
-    kept = voxel_indices(place, source.cloud, voxel, generator)
+    kept = random_voxel_indices(place, source.cloud, voxel, generator)
     # The voxels of a cloud in random order, clouds one after another.
     lot = torch.rand(len(kept), generator=generator, device=place.device, dtype=torch.float64)
     order = kept[torch.sort(source.cloud[kept] + lot)[1]]
@@ -142,7 +142,9 @@ def observe(
     return Clouds(cloud.reshape(S, O, count, 3), index.reshape(S, O, count), distinct.reshape(S, O))
 
 
-def voxel_indices(points: Tensor, cloud: Tensor, size: float, generator: torch.Generator) -> Tensor:
+def random_voxel_indices(
+    points: Tensor, cloud: Tensor, size: float, generator: torch.Generator
+) -> Tensor:
     """Indices of one point, drawn at random, of every occupied voxel of every cloud.
 
     points (M, 3) m, cloud (M,) the number of the cloud that each belongs to, size (m) of a voxel.

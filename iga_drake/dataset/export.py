@@ -68,7 +68,7 @@ def _plain(config: SampleConfig) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
-def digest(sample: Sample) -> str:
+def sample_digest(sample: Sample) -> str:
     """SHA-256 (hexadecimal) of a sample: names, types, shapes and exact bytes of its fields."""
     total = hashlib.sha256()
     for field in dataclasses.fields(sample):
@@ -103,7 +103,7 @@ class _Digest:
 
 
 def _digest_alone(split: str, index: int, config: SampleConfig | None) -> _Digest:
-    return _Digest(digest(make_sample(split, index, config)))
+    return _Digest(sample_digest(make_sample(split, index, config)))
 
 
 def _join(digests: Iterable[str]) -> str:
@@ -121,7 +121,7 @@ def shard_bytes(
     dataset = SampleDataset(split, config, make)
     samples = [dataset[index][1] for index in range(first, first + count)]
     header = _Shard(split, config, first, count).header()
-    header["digest"] = _join(map(digest, samples))
+    header["digest"] = _join(map(sample_digest, samples))
     fields = collate(samples)
     # Contiguous, as `collate` makes them: safetensors ignores an array's strides.
     tensors = {name: value.numpy() for name, value in fields.items() if torch.is_tensor(value)}
@@ -168,7 +168,7 @@ def read_shard(path: Path | str) -> list[Sample]:
             for name, values in header["fields"].items()
         }
         samples.append(Sample(**fields))
-    if _join(map(digest, samples)) != header["digest"]:
+    if _join(map(sample_digest, samples)) != header["digest"]:
         raise ExportError(f"{path}: its samples don't have its digest: damaged; export them again")
     return samples
 

@@ -35,8 +35,8 @@ from iga_drake.geometry.se3 import geodesic_angle, random_rotations, rigid, tran
 from iga_drake.training.energy_problems import (
     ProblemMaker,
     Problems,
-    displacement,
     make_problems,
+    pose_displacements,
     random_near,
 )
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
@@ -135,12 +135,12 @@ def placing_loss(
     with torch.no_grad():
         pick = int(torch.randint(len(valid), (), generator=generator))
         start = random_near(valid[pick], generator, 8 * config.starts)
-        start = start[displacement(start, valid, cloud) < NEAR][: config.starts]
-        if float(displacement(voted[:1], valid, cloud)) < VOTE_NEAR:
+        start = start[pose_displacements(start, valid, cloud) < NEAR][: config.starts]
+        if float(pose_displacements(voted[:1], valid, cloud)) < VOTE_NEAR:
             start = torch.cat((start, voted[:1]))
     if not len(start):
         return energy.temperature * 0
-    off = displacement(energy.refine(start, config.refinement), valid, cloud)
+    off = pose_displacements(energy.refine(start, config.refinement), valid, cloud)
     return (off / (off + FAR)).mean() * (FAR / 0.01)
 
 
@@ -166,7 +166,7 @@ def energy_loss(
             },
         )
         X = _candidates(detached, valid, config, generator)
-        off = displacement(X, valid, cloud)
+        off = pose_displacements(X, valid, cloud)
         target = (-0.5 * (off / config.target_sigma).square()).softmax(0)
     E = energy(X)
     log_share = (-E).log_softmax(0)
@@ -207,7 +207,7 @@ def energy_errors(net: PairEnergyNet, problems: Problems) -> dict[str, float]:
         with torch.no_grad():
             X, _ = minimise(net(problems.proposals(n)), also=voted)
         pair = torch.stack((X[0], voted[0]))
-        off = displacement(pair, valid, cloud)
+        off = pose_displacements(pair, valid, cloud)
         errors = []
         for Y in pair:
             ends = (transform(Z, cloud) for Z in valid)

@@ -180,7 +180,7 @@ def _made(split: str, first: int, maker: ProblemMaker, workers: int) -> dict[str
     return made
 
 
-def displacement(X: Tensor, valid: Tensor, cloud: Tensor) -> Tensor:
+def pose_displacements(X: Tensor, valid: Tensor, cloud: Tensor) -> Tensor:
     """(n,) m: mean distance of a cloud's points (P, 3) under poses X (n, 4, 4) from where the
     nearest of `valid` (v, 4, 4) puts them."""
     ends, goals = (cloud @ Y[:, :3, :3].transpose(1, 2) + Y[:, None, :3, 3] for Y in (X, valid))

@@ -24,7 +24,7 @@ from iga_drake.aligners.iga.local_encoder import EncoderConfig, LocalEncoder, lo
 from iga_drake.aligners.iga_paper.graph import GraphConfig, Nodes, moved
 from iga_drake.aligners.iga_paper.langevin import LangevinConfig, haar_rotations, langevin
 from iga_drake.aligners.iga_paper.model import OUTPUTS, PaperModel, kind_of
-from iga_drake.aligners.iga_paper.nodes import Problem, encode, problem
+from iga_drake.aligners.iga_paper.nodes import PaperProblem, encode, problem
 from iga_drake.aligners.iga_paper.search import (
     DISTANCE_UNIT,
     best,
@@ -232,7 +232,7 @@ class NodeStream:
         return self._kept[index]
 
 
-def drawn_problem(nodes: Nodes, config: PaperTraining, generator: torch.Generator) -> Problem:
+def drawn_problem(nodes: Nodes, config: PaperTraining, generator: torch.Generator) -> PaperProblem:
     """One of the alignments as the test, the others as demonstrations, as `any_test` and `turned`
     of the training say."""
     S, _, N = nodes.positions.shape[:3]
@@ -262,14 +262,14 @@ def moves(
     return R, translation * uniform(S, M, 3, generator=generator, device=device)
 
 
-def right_place(asked: Problem) -> Tensor:
+def right_place(asked: PaperProblem) -> Tensor:
     """(S, 3) where A's centre belongs from B's; the right rotation is none."""
     return asked.centres[0] - asked.centres[1]
 
 
 def candidates(
     model: PaperModel,
-    asked: Problem,
+    asked: PaperProblem,
     config: PaperTraining,
     step: int,
     generator: torch.Generator,
@@ -308,7 +308,7 @@ def candidates(
     return torch.cat((none, R), 1), torch.cat((place[:, None], t), 1)
 
 
-def energy_loss(
+def info_nce_loss(
     model: PaperModel, nodes: Nodes, config: PaperTraining, step: int, generator: torch.Generator
 ) -> Term:
     """InfoNCE (paper, eq. "aprox_distribution"), summed over samples, with its penalties.
@@ -460,7 +460,7 @@ def part_errors(
     return result
 
 
-def _motion(asked: Problem, R: Tensor, t: Tensor, turn: np.ndarray) -> np.ndarray:
+def _motion(asked: PaperProblem, R: Tensor, t: Tensor, turn: np.ndarray) -> np.ndarray:
     """(4, 4) in W by which a pose moves A away from its place there; `turn` (3, 3) from W."""
     c_A, c_B = (c[0].double().cpu().numpy() for c in asked.centres)
     rotation = R.double().cpu().numpy()
@@ -566,7 +566,7 @@ def train_paper(
         first=config.seed * SEED_STRIDE + seen + run.samples_seen,
         rank=ranks.rank, world=ranks.world, workers=workers, device=device,
     )  # fmt: skip
-    loss = energy_loss if part in ENERGIES else variant_loss
+    loss = info_nce_loss if part in ENERGIES else variant_loss
     while run.goes_on():
         net.graph.power_iteration()
         first = run.step * config.accumulate

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from iga_drake.dataset.depth_camera import CameraError, observe, visible, voxel_indices
+from iga_drake.dataset.depth_camera import CameraError, observe, random_voxel_indices, visible
 from iga_drake.dataset.depth_noise import DepthNoise
 
 NO_ERROR = DepthNoise(
@@ -229,14 +229,14 @@ def test_the_generator_decides_everything() -> None:
 def test_one_point_of_every_voxel_of_every_cloud() -> None:
     points = torch.randn(5000, 3, generator=_generator()) * 0.03
     cloud = torch.randint(4, (5000,), generator=_generator(1))
-    index = voxel_indices(points, cloud, 0.01, _generator(2))
+    index = random_voxel_indices(points, cloud, 0.01, _generator(2))
     key = torch.cat((cloud[:, None], torch.floor(points / 0.01).long()), 1).numpy()
     assert len(np.unique(key[index], axis=0)) == len(index) == len(np.unique(key, axis=0))
     assert (cloud[index].diff() >= 0).all()
     # Each point of a voxel is as likely as another.
     two = torch.tensor([[0.001, 0, 0], [0.002, 0, 0]])
     one = torch.zeros(2, dtype=torch.int64)
-    drawn = [int(voxel_indices(two, one, 0.01, _generator(k))[0]) for k in range(200)]
+    drawn = [int(random_voxel_indices(two, one, 0.01, _generator(k))[0]) for k in range(200)]
     assert 70 < sum(drawn) < 130
 
 

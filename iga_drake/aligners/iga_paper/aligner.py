@@ -10,7 +10,7 @@ from torch import Tensor
 
 from iga_drake.aligners.iga_paper.langevin import LangevinConfig
 from iga_drake.aligners.iga_paper.model import PaperModel, kind_of, load_model
-from iga_drake.aligners.iga_paper.nodes import Problem, problem
+from iga_drake.aligners.iga_paper.nodes import PaperProblem, problem
 from iga_drake.aligners.iga_paper.search import best, search_rotation, search_translation
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate
 from iga_drake.demonstrations.alignment import Alignment, check_cloud
@@ -71,7 +71,7 @@ def _drawn(cloud: np.ndarray, count: int, seed: int) -> Tensor:
 class Asked:
     """One problem (S = 1), and where its objects lie."""
 
-    problem: Problem
+    problem: PaperProblem
     centres: np.ndarray  # (2, 3) m, of the test's A and B in the frames given
 
     @staticmethod

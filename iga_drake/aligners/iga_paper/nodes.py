@@ -9,7 +9,7 @@ from iga_drake.aligners.iga.local_encoder import LocalEncoder
 from iga_drake.aligners.iga_paper.graph import A, B, Context, GraphNetwork, Nodes
 
 
-class Problem(NamedTuple):
+class PaperProblem(NamedTuple):
     """Nodes of S problems, both objects of the test about their own centres."""
 
     demonstrations: tuple[Nodes, Nodes]  # of A and B, (S, N, K), in their common frames
@@ -34,7 +34,7 @@ def encode(encoder: LocalEncoder, clouds: Tensor, count: int) -> Nodes:
     return Nodes(found.centres.unflatten(0, lead), found.vectors.unflatten(0, lead))
 
 
-def problem(alignments: Nodes) -> Problem:
+def problem(alignments: Nodes) -> PaperProblem:
     """From the nodes (S, 2, N + 1, K) of A and B in N + 1 alignments, the last one the test's."""
     shown = [Nodes(*(part[:, role, :-1] for part in alignments)) for role in (A, B)]
     asked = [Nodes(*(part[:, role, -1] for part in alignments)) for role in (A, B)]
@@ -43,4 +43,4 @@ def problem(alignments: Nodes) -> Problem:
         Nodes(nodes.positions - centre[:, None], nodes.vectors)
         for nodes, centre in zip(asked, centres, strict=True)
     ]
-    return Problem((shown[A], shown[B]), (test[A], test[B]), (centres[A], centres[B]))
+    return PaperProblem((shown[A], shown[B]), (test[A], test[B]), (centres[A], centres[B]))
