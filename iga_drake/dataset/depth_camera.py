@@ -66,7 +66,7 @@ class _Images(NamedTuple):
 
 
 class _LookUp(NamedTuple):
-    """Where samples fall in an image; all (S, K, O, P)."""
+    """The cells of an image that samples fall into; all (S, K, O, P)."""
 
     inside: Tensor  # bool
     key: Tensor  # index of the cell
@@ -74,7 +74,7 @@ class _LookUp(NamedTuple):
 
 
 def visible(points: Tensor, normals: Tensor, cameras: Tensor, *, spacing: Tensor | float) -> Tensor:
-    """Which surface samples every camera sees: (S, K, O, P) bool.
+    """Tells which surface samples every camera sees: (S, K, O, P) bool.
 
     Args:
       points, normals: (S, O, P, 3) samples of closed surfaces and their outward unit normals. The
@@ -167,7 +167,7 @@ def random_voxel_indices(
 
 
 class _Source:
-    """Where seen points come from, by the flat index of (S, K, O, P)."""
+    """The image, camera, cloud and sample of seen points, from flat indices of (S, K, O, P)."""
 
     def __init__(self, ray: Tensor, K: int, O: int, P: int):
         self.ray = ray  # (M,) of (S, K, O, P)

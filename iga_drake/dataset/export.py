@@ -38,7 +38,7 @@ class ExportError(IgaDrakeError):
 
 @dataclass(frozen=True)
 class Exported:
-    """What `export_shards` did."""
+    """The result of `export_shards`."""
 
     manifest: Path
     made: int  # shards
@@ -64,7 +64,7 @@ class _Shard:
 
 
 def _plain(config: SampleConfig) -> dict[str, Any]:
-    """As JSON gives it back: lists instead of tuples."""
+    """The options as JSON gives them back: lists instead of tuples."""
     return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
@@ -316,7 +316,7 @@ def _make(shard: _Shard) -> bytes:
 
 
 def _make_alone(shard: _Shard) -> bytes:
-    """The same in a process that shares its machine with others."""
+    """`_make` on one thread, in a process that shares its machine with others."""
     torch.set_num_threads(1)
     return _make(shard)
 
@@ -325,7 +325,7 @@ def _make_alone(shard: _Shard) -> bytes:
 def _jobs(
     jobs: int, backend: str, address: str | None
 ) -> Iterator[tuple[Callable[[list[_Shard]], Iterable[bytes]], int]]:
-    """What makes the bytes of shards, in their order, and how many at once."""
+    """A function from shards to their bytes, in order, and how many it makes at once."""
     if backend == "loky" and jobs == 1:
         yield lambda shards: map(_make, shards), 1
         return

@@ -34,7 +34,7 @@ CANONICAL_SIZE = (0.1, 0.3)  # m, log-uniform
 
 @dataclass(frozen=True)
 class SampleConfig:
-    """How samples are made, whatever the set."""
+    """Options by which samples of every set are made."""
 
     surface_points: int = 2000
     cloud_points: int = 256  # every observed cloud has this many (repeated where fewer are seen)
@@ -71,7 +71,7 @@ class Sample:
 
     @property
     def symmetries(self) -> tuple[Symmetry, Symmetry]:
-        """Of A's and B's families."""
+        """The symmetries of A's and B's families."""
         return _symmetry(self.category[0]), _symmetry(self.category[1])
 
 
@@ -124,7 +124,7 @@ def _category(
 
 
 def _symmetry(category: str) -> Symmetry:
-    """Of a family; nothing is known of composites and meshes."""
+    """The symmetry of a family; none for composites and meshes, of which none is known."""
     return FAMILIES[category].symmetry if category in FAMILIES else NO_SYMMETRY
 
 
@@ -135,7 +135,7 @@ def _kept(name: str, config: SampleConfig) -> list[int]:
 
 
 def stream_index(chosen: SampleSet, index: int, config: SampleConfig) -> int:
-    """Where the set's streams hold sample `index`."""
+    """The index at which the set's random streams hold sample `index`."""
     if index < 0:
         raise IndexError(f"sample {index} of '{chosen.name}': the first is 0")
     if chosen.symmetric:
@@ -249,10 +249,18 @@ def _carry_axis(axis: np.ndarray, rest: np.ndarray, vertices: np.ndarray) -> np.
 def surface_points(
     rng: np.random.Generator, vertices: np.ndarray, faces: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same surface points on all instances (n, V, 3): positions and normals (n, count, 3), and
-    the distance of neighbours (n,).
+    """Draws corresponding surface points on all instances of a shape.
 
     A face gets points by the largest share of area that it has on any instance.
+
+    Args:
+      rng: draws the points.
+      vertices: (n, V, 3) m, of n instances.
+      faces: (F, 3) int, of all instances.
+      count: points of an instance.
+
+    Returns positions (n, count, 3) m, unit normals (n, count, 3), and the mean distance of
+    neighbouring points (n,) m.
     """
     corner = vertices[:, faces[:, 0]]
     u, v = vertices[:, faces[:, 1]] - corner, vertices[:, faces[:, 2]] - corner

@@ -30,7 +30,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Draft:
-    """What a family makes of its parameters, before collision pieces are computed."""
+    """A shape's parts and frames, before its collision pieces are computed."""
 
     parts: tuple[Part, ...]
     frames: dict[str, np.ndarray] = field(default_factory=dict)  # name -> X_OF (4, 4)

@@ -108,7 +108,7 @@ class ShapeInstance:
 
     @cached_property
     def mass_properties(self) -> MassProperties:
-        """Of the homogeneous solid (what overlaps at a joint of two parts counts twice).
+        """Mass and inertia of the homogeneous solid; overlaps of joined parts count twice.
 
         Raises `ShapeError` where the mesh is not closed or is turned inside out.
         """
@@ -157,6 +157,6 @@ def _unit(vector: tuple[float, float, float] | np.ndarray) -> np.ndarray:
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of two vectors (3,); several times as quick as `np.cross`."""
+    """The cross product of two vectors (3,); several times as quick as `np.cross`."""
     (u, v, w), (x, y, z) = a.tolist(), b.tolist()
     return np.array([v * z - w * y, w * x - u * z, u * y - v * x])

@@ -76,7 +76,7 @@ class DifNetTraining(RunConfig):
 
 @dataclass(frozen=True)
 class DifNetSettings:
-    """All that the result of a training depends on, but for the weights that it starts from."""
+    """All settings of a training; they and the first weights determine its result."""
 
     model: DifNetConfig
     training: DifNetTraining

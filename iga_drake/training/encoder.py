@@ -61,7 +61,7 @@ class EncoderTraining(RunConfig):
 
 @dataclass(frozen=True)
 class EncoderSettings:
-    """All that the result of a training depends on."""
+    """All settings of a training; they determine its result."""
 
     encoder: EncoderConfig
     decoder: DecoderConfig

@@ -77,14 +77,14 @@ class EnergyTraining(RunConfig):
 
 @dataclass(frozen=True)
 class EnergySettings:
-    """All that the result of a training depends on, but for the descriptors."""
+    """All settings of a training; with the descriptors they determine its result."""
 
     model: EnergyConfig
     training: EnergyTraining
 
     @staticmethod
     def of(folder: Path) -> "EnergySettings":
-        """Those of the run in this folder, else the defaults. Raises `IgaDrakeError`."""
+        """The settings of the run in this folder, else the defaults. Raises `IgaDrakeError`."""
         saved = SavedState.read(folder, KIND)
         if saved is None:
             return EnergySettings(EnergyConfig(), EnergyTraining())
@@ -153,8 +153,11 @@ def energy_loss(
     config: EnergyTraining,
     generator: torch.Generator,
 ) -> Term:
-    """Of one problem: both terms of the loss (the cross-entropy above the least possible); energies
-    of the right pose and of the lowest wrong one, how often the right one is lower."""
+    """The loss of one problem: the placing term, and the cross-entropy above the least possible.
+
+    Statistics: both terms, the energies of the right pose and of the lowest wrong one, and how
+    often the right one is lower.
+    """
     energy = net(proposals)
     placing = placing_loss(energy, valid, voted, cloud, config, generator)
     with torch.no_grad():

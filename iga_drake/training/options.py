@@ -62,7 +62,7 @@ def add_run_options(
 
 
 def run_options(arguments: argparse.Namespace) -> RunOptions:
-    """How the run goes, from parsed options."""
+    """The options of a run, from parsed arguments."""
     return RunOptions(
         minutes=arguments.minutes,
         checkpoint_every=arguments.checkpoint_every,

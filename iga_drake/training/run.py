@@ -1,4 +1,4 @@
-"""What every training shares: schedule, steps, averaged weights, checkpoints, log, resuming.
+"""The run that all trainings share: schedule, steps, averaged weights, checkpoints, log, resuming.
 
 The gradient of a step is that of the mean over all items (matches, poses) of all samples of the
 step. Forward passes therefore give sums over items with their counts; gradients and counts are
@@ -75,7 +75,7 @@ class Term:
 
 @dataclass(frozen=True)
 class SavedState:
-    """All that resuming needs."""
+    """Tensors and card from which a run resumes."""
 
     tensors: dict[str, Tensor]
     card: dict
@@ -89,7 +89,7 @@ class SavedState:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run goes that doesn't change its result."""
+    """Options of a run that don't change its result."""
 
     minutes: float = math.inf  # stop after this long
     stop_at: int | None = None  # or after this step
@@ -231,14 +231,14 @@ class TrainingRun:
         return self.config.optimizer == "muon" and parameter.ndim == 2
 
     def _state_of(self, parameter: nn.Parameter) -> dict:
-        """The optimizer's, to read or fill."""
+        """The optimizer's state of a parameter, to read or fill."""
         return self._optimizers[
             0 if self.config.optimizer == "adamw" or self._by_muon(parameter) else 1
         ].state[parameter]
 
     @property
     def seconds(self) -> float:
-        """Since the training began, without pauses."""
+        """Seconds since the training began, without pauses."""
         return self._seconds + time.monotonic() - self._began
 
     @property

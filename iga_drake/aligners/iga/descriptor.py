@@ -42,7 +42,7 @@ class DescriptorConfig:
     descriptor: int = 64
     # Whether nodes attend to the object's other clouds after every layer but the last.
     cross: bool = True
-    # What first looks at the surroundings of a node: moments over the shells; or, for comparison,
+    # The first stage, which sees a node's surroundings: moments over the shells; or, to compare,
     # the local encoder, or the moments as plain coordinates (not invariant): see local_stages.py.
     local: str = "moments"
 

@@ -23,7 +23,7 @@ DISTINCT_TURN = 0.35  # rad
 
 @dataclass(frozen=True)
 class IgaPaperConfig:
-    """How the aligner searches."""
+    """Options of the search."""
 
     points: int = 256  # of a cloud, as in training; drawn where there are more
     rotation: LangevinConfig = field(default_factory=LangevinConfig)
@@ -33,13 +33,17 @@ class IgaPaperConfig:
 
 
 def landed(part: str) -> Path:
-    """Where the checkpoint of a part lies that comes with the package."""
+    """Path of the checkpoint of a part that comes with the package."""
     return models_dir() / "weights" / f"{kind_of(part)}.safetensors"
 
 
 def found_path(part: str, path: Path | str | None, name: str) -> Path:
-    """A part's checkpoint for the aligner `name`: a file, the landed one, or in a folder: of
-    checkpoints, or of trainings by part, the best where one was chosen. Raises `AlignerError`."""
+    """Path of a part's checkpoint for the aligner `name`.
+
+    `path` is the file itself, a folder of checkpoints, or a folder of trainings by part (the best
+    weights where validation chose any); None means the checkpoint that comes with the package.
+    Raises `AlignerError`.
+    """
     chosen = Path(path) if path else landed(part)
     file = f"{kind_of(part)}.safetensors"
     places = [chosen / file, chosen / part / "best.safetensors", chosen / part / file]
@@ -53,8 +57,8 @@ def found_path(part: str, path: Path | str | None, name: str) -> Path:
 
 
 def found_model(part: str, path: Path | str | None, name: str) -> PaperModel:
-    """The model of `found_path`. Raises `AlignerError`, and `CheckpointError` where it is a foreign
-    one."""
+    """The model of `found_path`. Raises `AlignerError`, and `CheckpointError` for another kind of
+    checkpoint."""
     return load_model(found_path(part, path, name), part)[0]
 
 
@@ -85,7 +89,10 @@ class Asked:
         seed: int,
         name: str,
     ) -> "Asked":
-        """Of clouds in metres. Raises `AlignerError`, which begins with `name`."""
+        """The problem of demonstrations and test clouds (P, 3) m, `points` drawn of each.
+
+        Raises `AlignerError`, which begins with `name`.
+        """
         if not context:
             raise AlignerError(f"{name}: the context is empty: give at least one demonstration")
         pairs = [(a.grasped, a.target) for a in context]

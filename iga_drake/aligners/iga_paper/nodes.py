@@ -17,7 +17,7 @@ class PaperProblem(NamedTuple):
     centres: tuple[Tensor, Tensor]  # (S, 3) m of the test's A and B: the means of their nodes
 
     def context(self, network: GraphNetwork) -> Context:
-        """What a network computes once."""
+        """The network's features of the problems, independent of the candidate poses."""
         return network.context(self.demonstrations, self.test)
 
     def offset(self) -> Tensor:
@@ -35,7 +35,7 @@ def encode(encoder: LocalEncoder, clouds: Tensor, count: int) -> Nodes:
 
 
 def problem(alignments: Nodes) -> PaperProblem:
-    """From the nodes (S, 2, N + 1, K) of A and B in N + 1 alignments, the last one the test's."""
+    """Problems from the nodes (S, 2, N + 1, K) of A and B in N + 1 alignments, the test's last."""
     shown = [Nodes(*(part[:, role, :-1] for part in alignments)) for role in (A, B)]
     asked = [Nodes(*(part[:, role, -1] for part in alignments)) for role in (A, B)]
     centres = [nodes.positions.mean(1) for nodes in asked]

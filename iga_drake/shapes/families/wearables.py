@@ -1,4 +1,4 @@
-"""What one wears: shoe, boot, cap and hat. They stand on z = 0, the front towards +x.
+"""Wearables: shoe, boot, cap and hat. They stand on z = 0, the front towards +x.
 
 Frames: `sole` under the middle of a sole, z up; `opening` in the middle of a shoe's or boot's
 opening, z out of it; `toe` and `heel` at the ends of a sole, x outwards; `head_opening` in the
