@@ -1,4 +1,4 @@
-"""What an aligner is asked when it is measured: aligned pairs, the last of them taken apart."""
+"""The question that an aligner is measured by: aligned pairs, the last of them taken apart."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ class Query:
 
     @staticmethod
     def of(points: np.ndarray, start: np.ndarray) -> "Query":
-        """From the clouds (2, N, P, 3) of N aligned pairs, the last one the test pair."""
+        """The query of clouds (2, N, P, 3) m of N aligned pairs, the last one the test pair."""
         context = tuple(Alignment(A, B) for A, B in zip(*points[:, :-1], strict=True))
         grasped = points[0, -1] @ start[:3, :3].T + start[:3, 3]
         return Query(context, grasped, points[1, -1], start)

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

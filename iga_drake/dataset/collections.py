@@ -8,7 +8,7 @@ from functools import cache, lru_cache
 
 import numpy as np
 
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.mesh_cleaning import MeshCleaning, MeshError
 from iga_drake.shapes.readers import MeshEntry, list_collection, read_mesh, split_of
 

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from iga_drake.dataset.depth_noise import DepthNoise, noisy_samples
 from iga_drake.errors import IgaDrakeError
 
 # Chosen by measurement against exact ray casting of the meshes.
@@ -27,32 +28,11 @@ GRAZING = 0.01  # cosine below which a surface isn't seen
 PIXELS = 80  # of an image's side; what doesn't fit is seen with wider cells
 _EDGE_CELLS = 8.0  # a depth edge is a step of this many cells
 _LOT_BITS = 16
-_PATCHES = 32  # of correlated noise along an image's side, a power of two; they repeat
+CALIBRATION = 0.002  # m, standard deviation of a camera's place along each axis
 
 
 class CameraError(IgaDrakeError):
     """The camera's input has a wrong shape."""
-
-
-@dataclass(frozen=True)
-class DepthNoise:
-    """Errors of a stereo depth camera, by default about those of an Intel RealSense D415.
-
-    A disparity error of s pixels is a depth error of z^2 s / (f b) with the focal length f (pixels)
-    and the baseline b (m): 1.3 mm at 0.8 m with the defaults.
-    """
-
-    focal_baseline: float = 33.8  # f b, pixel m: 615 pixels, 55 mm
-    disparity: float = 0.05  # pixels, standard deviation, independent at every point
-    patch_disparity: float = 0.05  # pixels, the same over a patch: matching is done by windows
-    patch: float = 0.012  # m, a patch's width
-    quantum: float = 1 / 32  # pixels, step of the disparity
-    # Surfaces seen at a cosine below the first are lost in part, below the second all.
-    grazing: tuple[float, float] = (0.3, 0.1)
-    edge_lost: float = 0.25  # share of the points at depth edges that are lost
-    edge_flying: float = 0.1  # share of them that fly behind the edge...
-    flying: float = 0.02  # ...by up to this (m)
-    calibration: float = 0.002  # m, standard deviation of a camera's place along each axis
 
 
 @dataclass(frozen=True)
@@ -86,7 +66,7 @@ class _Images(NamedTuple):
 
 
 class _LookUp(NamedTuple):
-    """Where samples fall in an image; all (S, K, O, P)."""
+    """The cells of an image that samples fall into; all (S, K, O, P)."""
 
     inside: Tensor  # bool
     key: Tensor  # index of the cell
@@ -94,7 +74,7 @@ class _LookUp(NamedTuple):
 
 
 def visible(points: Tensor, normals: Tensor, cameras: Tensor, *, spacing: Tensor | float) -> Tensor:
-    """Which surface samples every camera sees: (S, K, O, P) bool.
+    """Tells which surface samples every camera sees: (S, K, O, P) bool.
 
     Args:
       points, normals: (S, O, P, 3) samples of closed surfaces and their outward unit normals. The
@@ -117,13 +97,24 @@ def observe(
     voxel: float,
     count: int,
     noise: DepthNoise | None,
+    calibration: float = CALIBRATION,
     generator: torch.Generator,
 ) -> Clouds:
     """Clouds of `count` points of every object: what all cameras of a scene see, one point a voxel.
 
-    Arguments as of `visible`; `voxel` (m) is the grid's width, `generator` draws the noise and
-    which points remain. Where a cloud has fewer voxels than `count` its points repeat evenly;
-    where nothing is seen (`distinct` 0), points and index are 0.
+    Where a cloud has fewer voxels than `count` its points repeat evenly; where nothing is seen
+    (`distinct` 0), points and index are 0. Raises `CameraError` for wrong shapes.
+
+    Args:
+      points, normals: (S, O, P, 3) samples of closed surfaces and their outward unit normals. The
+        objects of a scene hide each other.
+      cameras: (S, K, 3) positions. They look at the middle of the scene.
+      spacing: (S, O) or one number: distance of neighbouring samples, sqrt(area / P).
+      voxel: m, width of the grid.
+      count: points of a cloud.
+      noise: errors of the depth; None leaves depths and cameras' places exact.
+      calibration: m, standard deviation of a camera's place along each axis, beside `noise`.
+      generator: draws the noise and which points remain.
     """
     S, O, P, _ = points.shape
     view = _look(points, normals, cameras)
@@ -132,9 +123,9 @@ def observe(
     source = _Source(seen, cameras.shape[1], O, P)
     place = points.reshape(-1, 3).index_select(0, source.sample)
     if noise is not None:
-        place, kept = _measure(place, cameras, view, images, source, noise, generator)
+        place, kept = _measure(place, cameras, view, images, source, noise, calibration, generator)
         place, source = place[kept], _Source(source.ray[kept], cameras.shape[1], O, P)
-    kept = voxel_indices(place, source.cloud, voxel, generator)
+    kept = random_voxel_indices(place, source.cloud, voxel, generator)
     # The voxels of a cloud in random order, clouds one after another.
     lot = torch.rand(len(kept), generator=generator, device=place.device, dtype=torch.float64)
     order = kept[torch.sort(source.cloud[kept] + lot)[1]]
@@ -151,7 +142,9 @@ def observe(
     return Clouds(cloud.reshape(S, O, count, 3), index.reshape(S, O, count), distinct.reshape(S, O))
 
 
-def voxel_indices(points: Tensor, cloud: Tensor, size: float, generator: torch.Generator) -> Tensor:
+def random_voxel_indices(
+    points: Tensor, cloud: Tensor, size: float, generator: torch.Generator
+) -> Tensor:
     """Indices of one point, drawn at random, of every occupied voxel of every cloud.
 
     points (M, 3) m, cloud (M,) the number of the cloud that each belongs to, size (m) of a voxel.
@@ -174,7 +167,7 @@ def voxel_indices(points: Tensor, cloud: Tensor, size: float, generator: torch.G
 
 
 class _Source:
-    """Where seen points come from, by the flat index of (S, K, O, P)."""
+    """The image, camera, cloud and sample of seen points, from flat indices of (S, K, O, P)."""
 
     def __init__(self, ray: Tensor, K: int, O: int, P: int):
         self.ray = ray  # (M,) of (S, K, O, P)
@@ -309,37 +302,20 @@ def _measure(
     images: _Images,
     source: _Source,
     noise: DepthNoise,
+    calibration: float,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Measured places (M, 3) of the seen samples `place` and which of them (M,) aren't lost."""
-
-    def draw(*shape: int, normal: bool = False) -> Tensor:
-        function = torch.randn if normal else torch.rand
-        return function(*shape, generator=generator, device=place.device, dtype=place.dtype)
-
-    M = len(place)
-    u, v, w = (field.flatten().index_select(0, source.ray) for field in view[:3])
-    cosine = view.cosine.flatten().index_select(0, source.ray)
-    # Disparity: f b / z.
-    patches = draw(len(images.cell.flatten()), _PATCHES, _PATCHES, normal=True)
-    column, row = (
-        torch.floor(coordinate / (w * noise.patch)).long() & (_PATCHES - 1) for coordinate in (u, v)
+    u, v, w, cosine = (
+        field.flatten().index_select(0, source.ray)
+        for field in (view.u, view.v, view.w, view.cosine)
     )
-    error = noise.disparity * draw(M, normal=True)
-    error += noise.patch_disparity * patches[source.image, row, column]
-    disparity = noise.focal_baseline * w + error
-    disparity = torch.round(disparity / noise.quantum) * noise.quantum
-    stretch = noise.focal_baseline * w / disparity  # measured z / true z
-    start, end = noise.grazing
-    kept = draw(M) < (cosine - end) / max(start - end, 1e-6)
     # Depth edges: a neighbouring cell is empty or lies well behind.
-    cell = images.cell.flatten()[source.image]
-    lowest = _lowest_near(images, source)
-    edge = lowest < w - _EDGE_CELLS * cell * w
-    fate = draw(M)
-    kept &= ~edge | (fate >= noise.edge_lost)
-    flies = edge & (fate >= noise.edge_lost) & (fate < noise.edge_lost + noise.edge_flying)
-    stretch += torch.where(flies, noise.flying * draw(M) * w, 0)
+    cell = images.cell.flatten()
+    edge = _lowest_near(images, source) < w - _EDGE_CELLS * cell[source.image] * w
+    stretch, kept = noisy_samples(u, v, w, cosine, edge, source.image, len(cell), noise, generator)
     camera = cameras.reshape(-1, 3)[source.camera]
-    offset = noise.calibration * draw(len(cameras) * cameras.shape[1], 3, normal=True)
+    shape = (len(cameras) * cameras.shape[1], 3)
+    offset = torch.randn(shape, generator=generator, device=place.device, dtype=place.dtype)
+    offset = calibration * offset
     return camera + (place - camera) * stretch[:, None] + offset[source.camera], kept

@@ -38,7 +38,7 @@ class ExportError(IgaDrakeError):
 
 @dataclass(frozen=True)
 class Exported:
-    """What `export_shards` did."""
+    """The result of `export_shards`."""
 
     manifest: Path
     made: int  # shards
@@ -64,11 +64,11 @@ class _Shard:
 
 
 def _plain(config: SampleConfig) -> dict[str, Any]:
-    """As JSON gives it back: lists instead of tuples."""
+    """The options as JSON gives them back: lists instead of tuples."""
     return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
-def digest(sample: Sample) -> str:
+def sample_digest(sample: Sample) -> str:
     """SHA-256 (hexadecimal) of a sample: names, types, shapes and exact bytes of its fields."""
     total = hashlib.sha256()
     for field in dataclasses.fields(sample):
@@ -103,7 +103,7 @@ class _Digest:
 
 
 def _digest_alone(split: str, index: int, config: SampleConfig | None) -> _Digest:
-    return _Digest(digest(make_sample(split, index, config)))
+    return _Digest(sample_digest(make_sample(split, index, config)))
 
 
 def _join(digests: Iterable[str]) -> str:
@@ -121,7 +121,7 @@ def shard_bytes(
     dataset = SampleDataset(split, config, make)
     samples = [dataset[index][1] for index in range(first, first + count)]
     header = _Shard(split, config, first, count).header()
-    header["digest"] = _join(map(digest, samples))
+    header["digest"] = _join(map(sample_digest, samples))
     fields = collate(samples)
     # Contiguous, as `collate` makes them: safetensors ignores an array's strides.
     tensors = {name: value.numpy() for name, value in fields.items() if torch.is_tensor(value)}
@@ -168,7 +168,7 @@ def read_shard(path: Path | str) -> list[Sample]:
             for name, values in header["fields"].items()
         }
         samples.append(Sample(**fields))
-    if _join(map(digest, samples)) != header["digest"]:
+    if _join(map(sample_digest, samples)) != header["digest"]:
         raise ExportError(f"{path}: its samples don't have its digest: damaged; export them again")
     return samples
 
@@ -310,7 +310,7 @@ def _make(shard: _Shard) -> bytes:
 
 
 def _make_alone(shard: _Shard) -> bytes:
-    """The same in a process that shares its machine with others."""
+    """`_make` on one thread, in a process that shares its machine with others."""
     torch.set_num_threads(1)
     return _make(shard)
 
@@ -319,7 +319,7 @@ def _make_alone(shard: _Shard) -> bytes:
 def _jobs(
     jobs: int, backend: str, address: str | None
 ) -> Iterator[tuple[Callable[[list[_Shard]], Iterable[bytes]], int]]:
-    """What makes the bytes of shards, in their order, and how many at once."""
+    """A function from shards to their bytes, in order, and how many it makes at once."""
     if backend == "loky" and jobs == 1:
         yield lambda shards: map(_make, shards), 1
         return

@@ -18,7 +18,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from iga_drake.dataset.depth_camera import DepthNoise, observe
+from iga_drake.dataset.depth_camera import observe
+from iga_drake.dataset.depth_noise import DepthNoise
 from iga_drake.dataset.samples import (
     SampleConfig,
     camera_positions,
@@ -38,7 +39,7 @@ _INSTANCE = 1  # 0 is the canonical one, which isn't deformed
 
 @dataclass(frozen=True)
 class OccupancyConfig:
-    """How occupancy samples are made, whatever the set."""
+    """Options by which occupancy samples of every set are made."""
 
     camera_points: int = 2000  # surface points that cameras may see
     cloud_points: int = 256  # the cloud has this many (repeated where fewer are seen)
@@ -153,7 +154,7 @@ def outer_surface(
 
 
 def inside(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Which points (n, 3) lie inside a closed surface of triangles (F, 3, 3): (n,) bool.
+    """Tells which points (n, 3) lie inside a closed surface of triangles (F, 3, 3): (n,) bool.
 
     Counts where a ray from each point leaves and enters the surface.
     """

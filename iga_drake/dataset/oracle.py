@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from iga_drake.dataset.samples import Sample
+from iga_drake.geometry.rigid_fit import rigid_fit
 
 MATCH_WITHIN = 0.05  # of the canonical size
 LEAST_MATCHES = 6
@@ -68,19 +69,12 @@ def _fit(sample: Sample, role: int, n: int) -> tuple[np.ndarray, float] | None:
     R, scale = _similarity(cy, y)
     goal = y[near] + scale * (cx - cy[near]) @ R.T
     spread = np.linalg.svd(x - x.mean(0), compute_uv=False) / np.sqrt(len(x))
-    R = _rotation(x, goal)
     X = np.eye(4)
-    X[:3, :3] = R
-    X[:3, 3] = goal.mean(0) - R @ x.mean(0)
+    X[:3, :3], X[:3, 3] = rigid_fit(x, goal)
     return X, max(float(spread[1]), 1e-4)
-
-
-def _rotation(source: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """(3, 3) that best turns source (n, 3) to goal, both about their means (Kabsch 1976)."""
-    U, _, Vt = np.linalg.svd((goal - goal.mean(0)).T @ (source - source.mean(0)))
-    return (U * [1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
 
 
 def _similarity(source: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, float]:
     """Rotation (3, 3) and scale that best carry source (n, 3) to goal."""
-    return _rotation(source, goal), float(np.sqrt(goal.var(0).sum() / source.var(0).sum()))
+    scale = float(np.sqrt(goal.var(0).sum() / source.var(0).sum()))
+    return rigid_fit(source, goal)[0], scale

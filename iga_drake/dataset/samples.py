@@ -15,8 +15,10 @@ import numpy as np
 import torch
 
 from iga_drake.dataset.collections import collection_keys, collection_mesh
-from iga_drake.dataset.depth_camera import Clouds, DepthNoise, observe
+from iga_drake.dataset.depth_camera import Clouds, observe
+from iga_drake.dataset.depth_noise import DepthNoise
 from iga_drake.dataset.splits import SampleSet, family_names, sample_set
+from iga_drake.geometry.rigid_fit import rigid_fit
 from iga_drake.shapes.composite import CompositeCategory
 from iga_drake.shapes.deformers import DeformableShape, Deformer, LatticeDeformer, PartDeformer
 from iga_drake.shapes.families import FAMILIES
@@ -32,7 +34,7 @@ CANONICAL_SIZE = (0.1, 0.3)  # m, log-uniform
 
 @dataclass(frozen=True)
 class SampleConfig:
-    """How samples are made, whatever the set."""
+    """Options by which samples of every set are made."""
 
     surface_points: int = 2000
     cloud_points: int = 256  # every observed cloud has this many (repeated where fewer are seen)
@@ -69,7 +71,7 @@ class Sample:
 
     @property
     def symmetries(self) -> tuple[Symmetry, Symmetry]:
-        """Of A's and B's families."""
+        """The symmetries of A's and B's families."""
         return _symmetry(self.category[0]), _symmetry(self.category[1])
 
 
@@ -122,7 +124,7 @@ def _category(
 
 
 def _symmetry(category: str) -> Symmetry:
-    """Of a family; nothing is known of composites and meshes."""
+    """The symmetry of a family; none for composites and meshes, of which none is known."""
     return FAMILIES[category].symmetry if category in FAMILIES else NO_SYMMETRY
 
 
@@ -133,7 +135,7 @@ def _kept(name: str, config: SampleConfig) -> list[int]:
 
 
 def stream_index(chosen: SampleSet, index: int, config: SampleConfig) -> int:
-    """Where the set's streams hold sample `index`."""
+    """The index at which the set's random streams hold sample `index`."""
     if index < 0:
         raise IndexError(f"sample {index} of '{chosen.name}': the first is 0")
     if chosen.symmetric:
@@ -240,17 +242,25 @@ def canonical_mesh(split: str, index: int, role: int) -> tuple[np.ndarray, np.nd
 def _carry_axis(axis: np.ndarray, rest: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     """An axis (2, 3) of `rest` (V, 3) where it best lies in the deformed `vertices` (V, 3)."""
     scale = np.sqrt(vertices.var(0).sum() / rest.var(0).sum())
-    R, p = _rigid_fit(scale * rest, vertices)
+    R, p = rigid_fit(scale * rest, vertices)
     return np.stack((scale * R @ axis[0] + p, R @ axis[1]))
 
 
 def surface_points(
     rng: np.random.Generator, vertices: np.ndarray, faces: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same surface points on all instances (n, V, 3): positions and normals (n, count, 3), and
-    the distance of neighbours (n,).
+    """Draws corresponding surface points on all instances of a shape.
 
     A face gets points by the largest share of area that it has on any instance.
+
+    Args:
+      rng: draws the points.
+      vertices: (n, V, 3) m, of n instances.
+      faces: (F, 3) int, of all instances.
+      count: points of an instance.
+
+    Returns positions (n, count, 3) m, unit normals (n, count, 3), and the mean distance of
+    neighbouring points (n,) m.
     """
     corner = vertices[:, faces[:, 0]]
     u, v = vertices[:, faces[:, 1]] - corner, vertices[:, faces[:, 2]] - corner
@@ -294,22 +304,11 @@ class _Alignment:
             distance = np.linalg.norm(canonical - canonical[pick], axis=1)
             near = distance <= np.quantile(distance, config.neighbourhood)
             self.near.append(near)
-            self.poses.append(_rigid_fit(shape.points[1:, near], canonical[near]))
+            self.poses.append(rigid_fit(shape.points[1:, near], canonical[near]))
             picks.append(pick)
         R, p = _relative_pose(rng, objects, picks)
         RA, pA = self.poses[0]
         self.poses[0] = (R @ RA, pA @ R.T + p)
-
-
-def _rigid_fit(source: np.ndarray, destination: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R (..., 3, 3), p (..., 3) that carry source (..., n, 3) to destination (Kabsch 1976)."""
-    source_mean = source.mean(-2, keepdims=True)
-    mean = destination.mean(-2, keepdims=True)
-    U, _, Vt = np.linalg.svd(np.swapaxes(destination - mean, -1, -2) @ (source - source_mean))
-    flip = np.ones(U.shape[:-1])
-    flip[..., 2] = np.sign(np.linalg.det(U @ Vt))
-    R = (U * flip[..., None, :]) @ Vt
-    return R, (mean - source_mean @ np.swapaxes(R, -1, -2))[..., 0, :]
 
 
 def _rotation(rng: np.random.Generator) -> np.ndarray:

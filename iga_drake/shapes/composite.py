@@ -17,7 +17,7 @@ from iga_drake.shapes.surfaces import (
     lathe,
     rounded_box,
     shell_profile,
-    transform,
+    transformed,
     tube,
 )
 
@@ -77,7 +77,7 @@ class CompositeCategory:
                 X[:3, :3] = _frame_along(direction, part.spin)
                 X[:3, 3] = place * 0.92
                 X = parent @ X
-            surfaces.append(transform(surface, X))
+            surfaces.append(transformed(surface, X))
             frames.append(X)
             reaches.append(np.maximum(np.abs(surface.vertices).max(0), 0.005))
         whole, _ = join(surfaces)

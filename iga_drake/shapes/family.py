@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from iga_drake.shapes.instance import ShapeError, ShapeInstance
+from iga_drake.shapes.errors import ShapeError
+from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.surfaces import Surface, join
 from iga_drake.shapes.symmetry import NO_SYMMETRY, Symmetry
 
@@ -29,7 +30,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Draft:
-    """What a family makes of its parameters, before collision pieces are computed."""
+    """A shape's parts and frames, before its collision pieces are computed."""
 
     parts: tuple[Part, ...]
     frames: dict[str, np.ndarray] = field(default_factory=dict)  # name -> X_OF (4, 4)
@@ -105,4 +106,5 @@ class Family:
             frames=draft.frames,
             convex_pieces=tuple(piece for part in draft.parts for piece in part.pieces()),
             density=self.density,
+            symmetry=self.symmetry,
         )

@@ -1,16 +1,14 @@
 """One object of a parametric family: mesh, parts, named frames, convex pieces, mass."""
 
+import dataclasses
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 import trimesh
 
-from iga_drake.errors import IgaDrakeError
-
-
-class ShapeError(IgaDrakeError):
-    """A shape's parameters, mesh or pieces are not valid."""
+from iga_drake.shapes.errors import ShapeError
+from iga_drake.shapes.symmetry import NO_SYMMETRY, Symmetry
 
 
 @dataclass(frozen=True)
@@ -40,6 +38,7 @@ class ShapeInstance:
     frames: dict[str, np.ndarray] = field(default_factory=dict)  # name -> X_OF (4, 4)
     convex_pieces: tuple[np.ndarray, ...] = ()  # each (n >= 4, 3) m, union covers the solid
     density: float = 1000.0  # kg / m^3
+    symmetry: Symmetry = NO_SYMMETRY  # rotations about an axis of O that carry it onto itself
 
     def __post_init__(self) -> None:
         vertices = np.asarray(self.vertices, dtype=np.float64)
@@ -109,7 +108,7 @@ class ShapeInstance:
 
     @cached_property
     def mass_properties(self) -> MassProperties:
-        """Of the homogeneous solid (what overlaps at a joint of two parts counts twice).
+        """Mass and inertia of the homogeneous solid; overlaps of joined parts count twice.
 
         Raises `ShapeError` where the mesh is not closed or is turned inside out.
         """
@@ -130,17 +129,7 @@ class ShapeInstance:
     def with_mass(self, mass: float) -> "ShapeInstance":
         """The same shape with the density that gives it `mass` (kg)."""
         scale = mass / self.mass_properties.mass
-        return ShapeInstance(
-            family=self.family,
-            parameters=self.parameters,
-            vertices=self.vertices,
-            faces=self.faces,
-            part_labels=self.part_labels,
-            part_names=self.part_names,
-            frames=self.frames,
-            convex_pieces=self.convex_pieces,
-            density=self.density * scale,
-        )
+        return dataclasses.replace(self, density=self.density * scale)
 
 
 def frame(
@@ -168,6 +157,6 @@ def _unit(vector: tuple[float, float, float] | np.ndarray) -> np.ndarray:
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of two vectors (3,); several times as quick as `np.cross`."""
+    """The cross product of two vectors (3,); several times as quick as `np.cross`."""
     (u, v, w), (x, y, z) = a.tolist(), b.tolist()
     return np.array([v * z - w * y, w * x - u * z, u * y - v * x])

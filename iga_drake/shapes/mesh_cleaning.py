@@ -13,7 +13,7 @@ import trimesh
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 
 # Vertices nearer to each other than about this share of the mesh's extent are one.
 _MERGE = 1e-6
@@ -33,7 +33,7 @@ class MeshError(ShapeError):
 
 @dataclass(frozen=True)
 class MeshCleaning:
-    """How meshes that are read become shapes."""
+    """Options by which meshes that are read are scaled, centred and decimated."""
 
     # Metres per unit of the file: 0.001 for millimetres.
     scale: float = 1.0
@@ -219,7 +219,7 @@ def _fill_small_holes(mesh: trimesh.Trimesh) -> None:
     edges = mesh.edges[once]
     bodies = _bodies(mesh)
     extent = (bodies.high - bodies.low).max(axis=1)
-    # Of the body that each boundary edge's start belongs to.
+    # Size of the body that each boundary edge's start belongs to.
     extent_at = dict(
         zip(edges[:, 0].tolist(), extent[bodies.labels[mesh.edges_face[once]]], strict=True)
     )

@@ -25,7 +25,7 @@ from typing import Literal
 import numpy as np
 import trimesh
 
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.mesh_cleaning import MeshCleaning, MeshError, clean_mesh, is_solid
 
 FORMATS = (".glb", ".gltf", ".obj", ".ply", ".stl")
@@ -48,7 +48,7 @@ class MeshEntry:
 
     @property
     def key(self) -> str:
-        """What identifies the mesh in its collection, and in `split_of`."""
+        """The mesh's name in its collection, "category/name"; the argument of `split_of`."""
         return f"{self.category}/{self.name}"
 
 
@@ -65,7 +65,7 @@ class MeshShape:
 
     @property
     def key(self) -> str:
-        """What identifies the mesh in its collection, and in `split_of`."""
+        """The mesh's name in its collection, "category/name"; the argument of `split_of`."""
         return f"{self.category}/{self.name}"
 
     @cached_property
@@ -81,7 +81,7 @@ class MeshShape:
 
 @dataclass
 class ReadReport:
-    """What became of the meshes that were asked for."""
+    """The meshes that were read, and those that were skipped with the reasons."""
 
     read: list[str] = field(default_factory=list)  # keys
     skipped: dict[str, str] = field(default_factory=dict)  # key -> reason

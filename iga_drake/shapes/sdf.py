@@ -18,7 +18,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from iga_drake.files import write_text
-from iga_drake.shapes.instance import ShapeError, ShapeInstance
+from iga_drake.shapes.errors import ShapeError
+from iga_drake.shapes.instance import ShapeInstance
 
 _CREASE = np.radians(40.0)
 

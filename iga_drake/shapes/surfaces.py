@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 
 
 class Surface(NamedTuple):
@@ -413,7 +413,7 @@ def ellipsoid(
     return Surface(surface.vertices * np.asarray(radii, dtype=np.float64), surface.faces)
 
 
-def transform(surface: Surface, X: np.ndarray) -> Surface:
+def transformed(surface: Surface, X: np.ndarray) -> Surface:
     """Moves a surface by X (4, 4), a rigid transform (or a scaling with positive determinant)."""
     return Surface(surface.vertices @ X[:3, :3].T + X[:3, 3], surface.faces)
 

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 
 Axis = Literal["x", "y", "z"]
 

@@ -45,7 +45,7 @@ from iga_drake.training.paper import (
     FRAMES,
     PaperTraining,
     common_turns,
-    energy_loss,
+    info_nce_loss,
     nodes_of,
     taken,
     variant_loss,
@@ -136,7 +136,7 @@ def paper_flops(model: PaperModel, card: dict) -> float:
     config = dataclasses.replace(config, batch=1, bf16=False)
     samples = replaced(SampleConfig(), card["samples"], "card")
     batch = collate([make_sample("train", 0, samples)])
-    loss = energy_loss if model.part in ENERGIES else variant_loss
+    loss = info_nce_loss if model.part in ENERGIES else variant_loss
     twin = PaperModel.described(model.description()).train()
 
     def step(number: int) -> None:

@@ -120,8 +120,8 @@ def build_robot_diagram(
     for source, sinks in WIRES.items():
         output, port = source.split(".", 1)
         for sink in sinks:
-            system, name = sink.split(".", 1)
-            builder.Connect(systems[output].GetOutputPort(port), systems[system].GetInputPort(name))
+            into, name = sink.split(".", 1)
+            builder.Connect(systems[output].GetOutputPort(port), systems[into].GetInputPort(name))
     diagram = builder.Build()
     diagram.set_name("robot")
     return RobotDiagram(diagram=diagram, station=station, fusion=fusion, policy=policy)

@@ -44,7 +44,7 @@ class DescriptorTraining(RunConfig):
 
 @dataclass(frozen=True)
 class DescriptorSettings:
-    """All that the result of a training depends on, but for the weights that it starts from."""
+    """All settings of a training; they and the first weights determine its result."""
 
     model: DescriptorConfig
     training: DescriptorTraining
@@ -52,7 +52,7 @@ class DescriptorSettings:
 
     @staticmethod
     def of(folder: Path) -> "DescriptorSettings":
-        """Those of the run in this folder, else the defaults. Raises `IgaDrakeError`."""
+        """The settings of the run in this folder, else the defaults. Raises `IgaDrakeError`."""
         saved = SavedState.read(folder, KIND)
         if saved is None:
             return DescriptorSettings(DescriptorConfig(), DescriptorTraining(), SampleConfig())
@@ -107,7 +107,7 @@ def correspondence_loss(
             "error_mean": error.mean(),
             "error_median": error.median(),
             "positive_logit": (target * logits).sum(-1)[valid].mean(),
-            # Of nodes that have a wrong match to choose.
+            # Only of nodes that have a wrong match to choose.
             "negative_logit": logits.masked_fill(~wrong, -torch.inf)
             .amax(-1)[valid & wrong.any(-1)]
             .mean(),

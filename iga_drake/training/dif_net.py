@@ -6,8 +6,6 @@ The losses are those of Deng, Yang & Tong (CVPR 2021), equations in `dif_net_los
 import argparse
 import dataclasses
 import hashlib
-import json
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +14,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from iga_drake.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from iga_drake.checkpoint import CheckpointError, load_checkpoint
 from iga_drake.shapes.dif_net import (
     KIND,
     DifNet,
@@ -24,25 +22,46 @@ from iga_drake.shapes.dif_net import (
     Normalisation,
     siren_jacobian,
 )
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.families import FAMILIES
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.training.options import add_run_options, run_options, with_options
+from iga_drake.training.ranks import process_group
+from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
+from iga_drake.training.settings import TrainingError, replaced
+
+# Options of the command that replace fields of the training's settings.
+OPTIONS: dict[str, tuple[type, str]] = {
+    "family": (str, "of the training shapes"),
+    "shapes": (int, "of the training set"),
+    "steps": (int, "of the whole training"),
+    "batch": (int, "shapes of a forward pass of one process"),
+    "accumulate": (int, "forward passes of one process in a step"),
+    "points": (int, "points of each shape in a forward pass"),
+    "learning_rate": (float, "at its highest"),
+    "seed": (int, "of the first weights, the shapes and the draws of them"),
+}
 
 
 @dataclass(frozen=True)
-class DifNetTraining:
-    """One training run; saved with the weights."""
+class DifNetTraining(RunConfig):
+    """One training run; saved with the weights. A sample is a shape with some of its points."""
 
+    batch: int = 4
+    steps: int = 10000
+    learning_rate: float = 1e-4
+    betas: tuple[float, float] = (0.9, 0.999)
+    warmup: int = 100
+    decay_share: float = 0.4
+    weight_decay: float = 0.0
+    clip: float = 1e3
+    ema: float = 0.0
+    bf16: bool = False
+    log_every: int = 50
     family: str = "chair"
     shapes: int = 150
     stored_points: int = 6000  # of each shape on the surface, and as many off it
-    batch: int = 4  # shapes a step
     points: int = 256  # of each shape a step: half on the surface, half off it
-    steps: int = 10000
-    learning_rate: float = 1e-4
     latent_rate: float = 10.0  # learning rate of the latents relative to that of the networks
-    warmup: int = 100
-    decay_share: float = 0.4  # of the steps, at the end: linear to zero
-    clip: float = 1e3
     # Weights of the losses, names as in `dif_net_loss`.
     sdf: float = 3e3
     off_surface: float = 5e2
@@ -53,7 +72,25 @@ class DifNetTraining:
     correction: float = 5e2
     latent: float = 1e3
     off_surface_rate: float = 1e2  # delta of exp(-delta |s|)
-    seed: int = 0
+
+
+@dataclass(frozen=True)
+class DifNetSettings:
+    """All settings of a training; they and the first weights determine its result."""
+
+    model: DifNetConfig
+    training: DifNetTraining
+
+    @staticmethod
+    def of(folder: Path) -> "DifNetSettings":
+        """The settings of the run in this folder, else the defaults. Raises `IgaDrakeError`."""
+        saved = SavedState.read(folder, KIND)
+        card = {} if saved is None else saved.card
+        where = folder / "state.safetensors"
+        return DifNetSettings(
+            replaced(DifNetConfig(), card.get("model", {}), f"{where}: model"),
+            replaced(DifNetTraining(), card.get("training", {}), f"{where}: training"),
+        )
 
 
 @dataclass(frozen=True)
@@ -154,8 +191,9 @@ def dif_net_loss(
     points: Tensor,
     distance: Tensor,
     config: DifNetTraining,
-) -> tuple[Tensor, dict[str, float]]:
-    """Weighted sum of the losses, and each of them, for shapes `index` (B,) at their samples.
+) -> Term:
+    """Weighted sum of the losses, and each of them, for shapes `index` (B,) at their samples
+    (B, P, 3) and distance (B, P) in the normalised frame.
 
     With S the surface points, O those off it, both together Omega, n the normals, d the distance:
 
@@ -197,15 +235,31 @@ def dif_net_loss(
         "correction": correction.abs().mean(),
         "latent": latent.square().mean(),
     }
-    loss = sum((getattr(config, name) * term for name, term in terms.items()), torch.zeros(()))
-    return loss, {"loss": float(loss.detach())} | {k: float(t.detach()) for k, t in terms.items()}
+    loss = sum(getattr(config, name) * term for name, term in terms.items())
+    assert isinstance(loss, Tensor)
+    return Term(loss, torch.ones(()), terms)
 
 
-def _learning_rate(step: int, config: DifNetTraining) -> float:
-    decay = max(1, int(config.decay_share * config.steps))
-    return config.learning_rate * min(
-        1.0, (step + 1) / config.warmup, max(0.01, (config.steps - step) / decay)
-    )
+def _draw(config: DifNetTraining, world: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Random choices of a step, the same in all processes and one for every forward pass: shapes
+    (accumulate, world, B), and which of their points on and off the surface (..., B, points / 2).
+    """
+    passes = (config.accumulate, world)
+    index = torch.rand(*passes, config.shapes).argsort(-1)[..., : config.batch]
+    on, off = torch.randint(config.stored_points, (2, *index.shape, config.points // 2))
+    return index, on, off
+
+
+def _take_over(net: DifNet, path: Path) -> None:
+    """Loads weights of as many shapes; raises `CheckpointError`."""
+    loaded, card = load_checkpoint(path, kind=KIND)
+    try:
+        net.load_state_dict(loaded)
+    except RuntimeError as error:
+        raise CheckpointError(
+            f"{path}: {len(loaded['latents'])} shapes, model {card['model']}; expected "
+            f"{len(net.latents)} shapes, model {dataclasses.asdict(net.config)}"
+        ) from error
 
 
 def train_dif_net(
@@ -214,165 +268,100 @@ def train_dif_net(
     model: DifNetConfig | None = None,
     config: DifNetTraining | None = None,
     device: str = "cpu",
-    minutes: float = float("inf"),
     initial: Path | None = None,
-    checkpoint_every: int = 500,
-    stop_at: int | None = None,
+    options: RunOptions | None = None,
 ) -> dict:
-    """Trains until `config.steps`, `stop_at` or `minutes`; resumes from `output` where it can.
+    """Trains until `config.steps`, or as `options` say; resumes from `output` where it can.
 
-    Writes `output`/dif_net.safetensors (weights and latents), `output`/state.safetensors (these
-    and the optimiser's moments: all that resuming needs) and `output`/log.jsonl. A resumed run
-    keeps the model and the training configuration of its state, but for `steps`. `initial` names
-    weights of as many shapes to start from instead of at random. Returns the card.
-    Raises `CheckpointError` for a damaged state, `ShapeError` where the family has changed since.
+    Writes the files of `TrainingRun` to `output`; dif-net.safetensors holds networks and latents.
+    A resumed run keeps the settings of its state, those that are given aside. `initial` names
+    weights of as many shapes to start from instead of at random. Returns the card. Raises
+    `IgaDrakeError`, also where the family makes other shapes than when the run began.
     """
-    config, model = config or DifNetTraining(), model or DifNetConfig()
+    saved = SavedState.read(output, KIND)
+    before = DifNetSettings.of(output)
     state_path = output / "state.safetensors"
-    torch.manual_seed(config.seed)
-    step, seconds = 0, 0.0
-    tensors: dict[str, Tensor] = {}
-    if state_path.is_file():
-        tensors, card = load_checkpoint(state_path, kind=KIND + "-state")
-        model = DifNetConfig(**card["model"])
-        config = dataclasses.replace(DifNetTraining(**card["training"]), steps=config.steps)
-        step, seconds = card["step"], card["seconds"]
-    net = DifNet(model, config.shapes).to(device)
-    networks = [p for p in net.parameters() if p is not net.latents]
-    if initial is not None and not tensors:
-        loaded, card = load_checkpoint(initial, kind=KIND)
-        try:
-            net.load_state_dict(loaded)
-        except RuntimeError as error:
-            raise CheckpointError(
-                f"{initial}: {len(loaded['latents'])} shapes, model {card['model']}; expected "
-                f"{config.shapes} shapes, model {dataclasses.asdict(model)}"
-            ) from error
-    optimizer = torch.optim.Adam([{"params": networks}, {"params": [net.latents]}], fused=True)
-    if tensors:
-        for name, parameter in net.named_parameters():
-            parameter.data.copy_(tensors[f"net.{name}"])
-            optimizer.state[parameter] = {
-                "step": torch.tensor(float(step)),
-                "exp_avg": tensors[f"m.{name}"].to(device),
-                "exp_avg_sq": tensors[f"v.{name}"].to(device),
-            }
-        torch.set_rng_state(tensors["rng"])
+    if saved is not None and model not in (None, before.model):
+        raise TrainingError(
+            f"{state_path}: has another model than the one asked for ({before.model}): train in "
+            "another folder"
+        )
+    model, config = model or before.model, config or before.training
     shapes = training_shapes(config)
     digest = shapes_digest(shapes)
-    if tensors and card["shapes_digest"] != digest:
+    if saved is not None and saved.card["shapes_digest"] != digest:
         raise ShapeError(
             f"{state_path}: family '{config.family}' makes other shapes now than when this "
             "training began: train anew in another folder"
         )
+    torch.manual_seed(config.seed)
+    net = DifNet(model, config.shapes).to(device)
+    if initial is not None and saved is None:
+        _take_over(net, initial)
     samples = SdfSamples(
         *(t.to(device) for t in dataclasses.astuple(training_samples(shapes, config)))
     )
-    output.mkdir(parents=True, exist_ok=True)
-    began = time.monotonic()
-    recent: list[dict] = []
-
-    def write() -> dict:
-        card = {
-            "model": dataclasses.asdict(model),
-            "training": dataclasses.asdict(config),
-            "shapes_digest": digest,
-            "step": step,
-            "points_seen": step * config.batch * config.points,
-            "seconds": seconds + time.monotonic() - began,
-            "parameters": sum(p.numel() for p in net.parameters()),
-        }
-        save_checkpoint(output / "dif_net.safetensors", net.state_dict(), kind=KIND, card=card)
-        state: dict[str, Tensor] = {f"net.{n}": p for n, p in net.named_parameters()}
-        for n, p in net.named_parameters():
-            moments = optimizer.state.get(p, {})
-            state[f"m.{n}"] = moments.get("exp_avg", torch.zeros_like(p))
-            state[f"v.{n}"] = moments.get("exp_avg_sq", torch.zeros_like(p))
-        state["rng"] = torch.get_rng_state()
-        save_checkpoint(state_path, state, kind=KIND + "-state", card=card)
-        return card
-
-    half = config.points // 2
-    last = config.steps if stop_at is None else min(stop_at, config.steps)
-    with (output / "log.jsonl").open("a", encoding="utf-8") as log:
-        while step < last and time.monotonic() - began < 60 * minutes:
-            index = torch.randperm(config.shapes)[: config.batch].to(device)
-            on, off = torch.randint(config.stored_points, (2, len(index), half)).to(device)
-            row = index[:, None]
-            rate = _learning_rate(step, config)
-            for group, factor in zip(optimizer.param_groups, (1, config.latent_rate), strict=True):
-                group["lr"] = factor * rate
-            loss, terms = dif_net_loss(
+    run = TrainingRun(
+        output,
+        KIND,
+        net,
+        config,
+        saved=saved,
+        card={"model": dataclasses.asdict(model), "shapes_digest": digest},
+        options=options,
+        rate_factors={"latents": config.latent_rate},
+    )
+    while run.goes_on():
+        mine = (drawn[:, run.ranks.rank].to(device) for drawn in _draw(config, run.ranks.world))
+        row = run.advance(
+            dif_net_loss(
                 net,
                 index,
-                samples.surface[row, on],
-                samples.normals[row, on],
-                samples.points[row, off],
-                samples.distance[row, off],
+                samples.surface[index[:, None], on],
+                samples.normals[index[:, None], on],
+                samples.points[index[:, None], off],
+                samples.distance[index[:, None], off],
                 config,
             )
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(net.parameters(), config.clip)
-            optimizer.step()
-            step += 1
-            recent.append(terms)
-            if step % 50 == 0:
-                mean = {key: float(np.mean([r[key] for r in recent])) for key in recent[0]}
-                mean |= {"step": step, "seconds": seconds + time.monotonic() - began}
-                log.write(json.dumps(mean) + "\n")
-                log.flush()
-                recent = []
-                if step % 200 == 0:
-                    print(
-                        f"step {step}: loss {mean['loss']:.1f} sdf {mean['sdf']:.4f} normals "
-                        f"{mean['normal']:.3f} template normals {mean['template_normal']:.3f} "
-                        f"smooth {mean['smooth']:.3f} correction {mean['correction']:.4f}, "
-                        f"{mean['seconds']:.0f} s",
-                        flush=True,
-                    )
-            if step % checkpoint_every == 0:
-                write()
-    return write()
+            for index, on, off in zip(*mine, strict=True)
+        )
+        if row and run.ranks.first and run.step % (4 * config.log_every) == 0:
+            print(
+                f"step {run.step}: loss {row['loss']:.1f} sdf {row['sdf']:.4f} normals "
+                f"{row['normal']:.3f} template normals {row['template_normal']:.3f} smooth "
+                f"{row['smooth']:.3f} correction {row['correction']:.4f}, "
+                f"{row['samples_per_second']:.1f} shapes/s",
+                flush=True,
+            )
+    card = run.save()
+    run.close()
+    return card
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga train dif-net`."""
-    parser.add_argument("--out", type=Path, required=True, help="folder of weights, state and log")
-    parser.add_argument("--family", default=DifNetTraining.family, help="of the training shapes")
-    parser.add_argument("--shapes", type=int, default=DifNetTraining.shapes)
-    parser.add_argument("--steps", type=int, default=DifNetTraining.steps)
-    parser.add_argument("--batch", type=int, default=DifNetTraining.batch, help="shapes a step")
-    parser.add_argument(
-        "--points", type=int, default=DifNetTraining.points, help="points of each shape a step"
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after this long")
+    add_run_options(parser, OPTIONS, workers=False)
     parser.add_argument("--initial", type=Path, help="start from these weights of as many shapes")
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch on the CPU")
 
 
 def main(arguments: argparse.Namespace) -> int:
     """Runs the training; a run that was stopped (or killed) goes on from its last checkpoint."""
     torch.set_num_threads(arguments.threads)
     torch.set_flush_denormal(True)
-    card = train_dif_net(
-        arguments.out,
-        config=DifNetTraining(
-            family=arguments.family,
-            shapes=arguments.shapes,
-            steps=arguments.steps,
-            batch=arguments.batch,
-            points=arguments.points,
-            seed=arguments.seed,
-        ),
-        device=arguments.device,
-        minutes=arguments.minutes,
-        initial=arguments.initial,
+    settings: DifNetSettings = with_options(
+        DifNetSettings.of(arguments.out), arguments, fields=OPTIONS
     )
+    with process_group(arguments.device) as device:
+        card = train_dif_net(
+            arguments.out,
+            model=settings.model,
+            config=settings.training,
+            device=device,
+            initial=arguments.initial,
+            options=run_options(arguments),
+        )
     print(
-        f"step {card['step']}, {card['points_seen']} points seen, {card['seconds']:.0f} s: "
-        f"{arguments.out / 'dif_net.safetensors'}"
+        f"step {card['step']}, {card['samples_seen']} shapes seen, {card['seconds']:.0f} s: "
+        f"{arguments.out / f'{KIND}.safetensors'}"
     )
     return 0

@@ -6,11 +6,8 @@ begins change from step to step; a batch serves for a few steps, each with its s
 """
 
 import argparse
+import copy
 import dataclasses
-import json
-import math
-import subprocess
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,46 +22,64 @@ from iga_drake.aligners.iga.local_encoder import (
     EncoderConfig,
     OccupancyNet,
 )
-from iga_drake.checkpoint import load_checkpoint, save_checkpoint
 from iga_drake.dataset.loader import Batch, sample_loader
 from iga_drake.dataset.occupancy import OccupancyConfig, make_occupancy_sample
 from iga_drake.geometry.clouds import furthest_point_sampling
 from iga_drake.precision import mixed_precision
+from iga_drake.training.options import add_run_options, run_options, with_options
+from iga_drake.training.ranks import process_group
+from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
+from iga_drake.training.settings import TrainingError, replaced
+
+SEED_STRIDE = 10_000_000  # samples between the streams of two seeds
 
 # Logits (B, Q) at queries (B, Q, 3) from clouds (B, P, 3) with centres (B, K), by index.
 Predictor = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
-class EncoderTraining:
-    """One training run; saved with the weights."""
+class EncoderTraining(RunConfig):
+    """One training run; saved with the weights. A sample is a cloud with its queries."""
 
-    batch: int = 8  # clouds
+    batch: int = 8
     uses: int = 4  # steps in a row with one batch, each with other centres and queries
     steps: int = 12000
     learning_rate: float = 1e-3
+    betas: tuple[float, float] = (0.9, 0.999)
     warmup: int = 50
+    decay_share: float = 1.0
+    decay: str = "cosine"
     weight_decay: float = 0.01
-    clip: float = 1.0
-    ema: float = 0.998
     centres: tuple[int, int] = (8, 32)  # log-uniform
-    bf16: bool = True  # autocast of the matrix products
-    seed: int = 0
+    validation_samples: int = 64
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.uses < 1:
+            raise TrainingError(f"uses = {self.uses}, must be at least 1")
 
 
-def _batches(
-    split: str, samples: OccupancyConfig, batch: int, first: int, count: int | None, workers: int
-) -> Iterator[Batch]:
-    loader = sample_loader(
-        split,
-        batch=batch,
-        first=first,
-        count=count,
-        workers=workers,
-        config=samples,  # type: ignore[arg-type]
-        make=make_occupancy_sample,  # type: ignore[arg-type]
-    )
-    return iter(loader)
+@dataclass(frozen=True)
+class EncoderSettings:
+    """All settings of a training; they determine its result."""
+
+    encoder: EncoderConfig
+    decoder: DecoderConfig
+    training: EncoderTraining
+    samples: OccupancyConfig
+
+    @staticmethod
+    def of(folder: Path) -> "EncoderSettings":
+        """The settings of the run in this folder, else the defaults. Raises `IgaDrakeError`."""
+        saved = SavedState.read(folder, ENCODER)
+        card = {} if saved is None else saved.card
+        where = folder / "state.safetensors"
+        return EncoderSettings(
+            replaced(EncoderConfig(), card.get("encoder", {}), f"{where}: encoder"),
+            replaced(DecoderConfig(), card.get("decoder", {}), f"{where}: decoder"),
+            replaced(EncoderTraining(), card.get("training", {}), f"{where}: training"),
+            replaced(OccupancyConfig(), card.get("samples", {}), f"{where}: samples"),
+        )
 
 
 def occupancy_scores(
@@ -76,14 +91,22 @@ def occupancy_scores(
     samples: OccupancyConfig | None = None,
     first: int = 0,
 ) -> dict[str, dict[str, float]]:
-    """Of each predictor over all queries of `count` samples of a set.
+    """Scores of each predictor over all queries of `count` samples of a set.
 
     accuracy: share of the queries told rightly; iou: intersection over union of what is and what
     is said to be occupied; iou_uniform: the same over the uniform queries alone, the volumes'.
     """
     samples = samples or OccupancyConfig()
     sums = {name: np.zeros(6) for name in predictors}
-    for batch in _batches(split, samples, 16, first, count, 0):
+    batches = sample_loader(
+        split,
+        batch=16,
+        first=first,
+        count=count,
+        config=samples,  # type: ignore[arg-type]
+        make=make_occupancy_sample,  # type: ignore[arg-type]
+    )
+    for batch in batches:
         points = batch["points"]
         index = furthest_point_sampling(points, centres)
         true, uniform = batch["distance"] < samples.shell, batch["uniform"]
@@ -134,37 +157,58 @@ def network_predictor(net: OccupancyNet) -> Predictor:
 
 
 def occupancy_loss(
-    net: OccupancyNet, batch: dict[str, Tensor], config: EncoderTraining, shell: float
-) -> tuple[Tensor, dict[str, float]]:
-    """Binary cross-entropy and statistics of one step, with random centres."""
+    net: OccupancyNet,
+    batch: Batch,
+    config: EncoderTraining,
+    *,
+    shell: float,
+    count: int,
+    start: Tensor,
+) -> Term:
+    """Binary cross-entropy summed over the queries of a batch, and the share told rightly.
+
+    Args:
+      batch: points (B, P, 3), queries (B, Q, 3) and distance (B, Q) to the surface, m.
+      shell: m, distance below which a query is occupied.
+      count: centres of a cloud.
+      start: (B,) indices of the points that furthest point sampling starts from.
+    """
     points = batch["points"]
-    low, high = config.centres
-    count = round(low * (high / low) ** float(torch.rand(())))
-    start = torch.randint(points.shape[1], (len(points),)).to(points.device)
     index = furthest_point_sampling(points, count, start)
     target = (batch["distance"] < shell).float()
     with mixed_precision(points.device, config.bf16):
         logits = net(points, batch["queries"], index)
     logits = logits.float()
-    loss = torch.nn.functional.binary_cross_entropy_with_logits(logits, target)
+    loss = torch.nn.functional.binary_cross_entropy_with_logits(logits, target, reduction="sum")
     right = ((logits > 0) == (target > 0)).float().mean()
-    return loss, {"loss": float(loss.detach()), "accuracy": float(right)}
+    return Term(loss, torch.tensor(target.numel()), {"accuracy": right})
 
 
-def _learning_rate(step: int, config: EncoderTraining) -> float:
-    """Warm-up, then a cosine to 1 %."""
-    progress = min(1.0, step / max(1, config.steps))
-    cosine = 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress))
-    return config.learning_rate * min((step + 1) / config.warmup, cosine)
+def _draw(points: int, config: EncoderTraining, world: int) -> tuple[int, Tensor]:
+    """Random choices of a step, the same in all processes: the number of centres, and the points
+    (accumulate, world, batch) that furthest point sampling starts from in clouds of `points`."""
+    low, high = config.centres
+    count = round(low * (high / low) ** float(torch.rand(())))
+    return count, torch.randint(points, (config.accumulate, world, config.batch))
 
 
-def _commit() -> str:
-    """The commit of the checkout that this package runs from; empty outside of one."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return ""
+def _batches(
+    config: EncoderTraining, samples: OccupancyConfig, run: TrainingRun, workers: int
+) -> Iterator[Batch]:
+    """This process's batches from where the run stands."""
+    a_step = config.batch * config.accumulate * run.ranks.world
+    used = run.samples_seen // (a_step * config.uses) * a_step
+    loader = sample_loader(
+        "train",
+        batch=config.batch,
+        first=config.seed * SEED_STRIDE + used,
+        rank=run.ranks.rank,
+        world=run.ranks.world,
+        workers=workers,
+        config=samples,  # type: ignore[arg-type]
+        make=make_occupancy_sample,  # type: ignore[arg-type]
+    )
+    return iter(loader)
 
 
 def train_encoder(
@@ -175,175 +219,137 @@ def train_encoder(
     config: EncoderTraining | None = None,
     samples: OccupancyConfig | None = None,
     device: str = "cpu",
-    minutes: float = float("inf"),
-    checkpoint_every: int = 200,
-    stop_at: int | None = None,
-    validation_count: int = 64,
     workers: int = 0,
+    options: RunOptions | None = None,
 ) -> dict:
-    """Trains until `config.steps`, `stop_at` or `minutes`; resumes from `output` where it can.
+    """Trains until `config.steps`, or as `options` say; resumes from `output` where it can.
 
-    Writes `output`/encoder.safetensors (EMA weights of encoder and decoder),
-    `output`/state.safetensors (all that resuming needs) and `output`/log.jsonl. A resumed run
-    keeps the sizes and the settings of its state, but for `steps`. Returns the card, which ends
-    with scores on the validation set. Raises `CheckpointError` for a damaged state.
+    Writes the files of `TrainingRun` to `output`; encoder.safetensors holds encoder and decoder. A
+    resumed run keeps the settings of its state, those that are given aside. Every use of a cloud
+    counts in `samples_seen`. Returns the card, which ends with scores of the EMA weights over
+    `config.validation_samples` samples of the validation set. Raises `IgaDrakeError`.
     """
-    encoder, decoder = encoder or EncoderConfig(), decoder or DecoderConfig()
-    config, samples = config or EncoderTraining(), samples or OccupancyConfig()
-    state_path = output / "state.safetensors"
+    saved = SavedState.read(output, ENCODER)
+    before = EncoderSettings.of(output)
+    for given, own in ((encoder, before.encoder), (decoder, before.decoder)):
+        if saved is not None and given not in (None, own):
+            raise TrainingError(
+                f"{output / 'state.safetensors'}: has another model than the one asked for "
+                f"({own}): train in another folder"
+            )
+    encoder, decoder = encoder or before.encoder, decoder or before.decoder
+    config, samples = config or before.training, samples or before.samples
     torch.manual_seed(config.seed)
-    step, seconds = 0, 0.0
-    tensors: dict[str, Tensor] = {}
-    if state_path.is_file():
-        tensors, card = load_checkpoint(state_path, kind=ENCODER + "-state")
-        encoder, decoder = EncoderConfig(**card["encoder"]), DecoderConfig(**card["decoder"])
-        saved = card["training"] | {"centres": tuple(card["training"]["centres"])}
-        config = EncoderTraining(**saved | {"steps": config.steps})
-        near = tuple((share, sigma) for share, sigma in card["samples"]["near"])
-        samples = OccupancyConfig(**card["samples"] | {"near": near})
-        step, seconds = card["step"], card["seconds"]
     net = OccupancyNet(encoder, decoder).to(device)
-    named = dict(net.named_parameters())
-    optimizer = torch.optim.AdamW(
-        named.values(), lr=config.learning_rate, weight_decay=config.weight_decay
-    )
-    ema = {n: p.detach().clone() for n, p in named.items()}
-    if tensors:
-        net.load_state_dict({n: tensors[f"net.{n}"] for n in named})
-        for name, parameter in named.items():
-            ema[name] = tensors[f"ema.{name}"].to(device)
-            if f"m.{name}" in tensors:
-                optimizer.state[parameter] = {
-                    "step": torch.tensor(float(step)),
-                    "exp_avg": tensors[f"m.{name}"].to(device),
-                    "exp_avg_sq": tensors[f"v.{name}"].to(device),
-                }
-        torch.set_rng_state(tensors["rng"])
-    output.mkdir(parents=True, exist_ok=True)
-    began = time.monotonic()
-    recent: list[dict] = []
-    whole: Batch = {}
 
-    def write() -> dict:
-        card = {
+    def scores(weights: dict[str, Tensor]) -> dict[str, float]:
+        measured = copy.deepcopy(net).eval()
+        measured.load_state_dict(weights)
+        predictors = {ENCODER: network_predictor(measured)}
+        count = config.validation_samples
+        return occupancy_scores(predictors, split="validation", count=count, samples=samples)[
+            ENCODER
+        ]
+
+    def validate(weights: dict[str, Tensor]) -> dict[str, float]:
+        found = scores(weights)
+        return {"wrong": 1 - found["accuracy"]} | found
+
+    run = TrainingRun(
+        output,
+        ENCODER,
+        net,
+        config,
+        saved=saved,
+        card={
             "encoder": dataclasses.asdict(encoder),
             "decoder": dataclasses.asdict(decoder),
-            "training": dataclasses.asdict(config),
             "samples": dataclasses.asdict(samples),
-            "step": step,
-            "samples_seen": math.ceil(step / config.uses) * config.batch,
-            "seconds": seconds + time.monotonic() - began,
-            "parameters": sum(p.numel() for p in net.encoder.parameters()),
-            "decoder_parameters": sum(p.numel() for p in net.decoder.parameters()),
-            "commit": _commit(),
-        }
-        save_checkpoint(output / "encoder.safetensors", ema, kind=ENCODER, card=card)
-        state: dict[str, Tensor] = {f"net.{n}": p for n, p in named.items()}
-        state |= {f"ema.{n}": t for n, t in ema.items()}
-        for n, p in named.items():
-            if moments := optimizer.state.get(p):
-                state |= {f"m.{n}": moments["exp_avg"], f"v.{n}": moments["exp_avg_sq"]}
-        state["rng"] = torch.get_rng_state()
-        save_checkpoint(state_path, state, kind=ENCODER + "-state", card=card)
-        return card
-
-    first = config.seed * 10_000_000 + step // config.uses * config.batch
-    batches = _batches("train", samples, config.batch, first, None, workers)
-    last = config.steps if stop_at is None else min(stop_at, config.steps)
-    with (output / "log.jsonl").open("a", encoding="utf-8") as log:
-        while step < last and time.monotonic() - began < 60 * minutes:
-            use = step % config.uses
-            if use == 0 or not whole:
-                whole = next(batches)
-            some = slice(use, None, config.uses)  # queries are in random order
-            batch = {
-                "points": whole["points"].to(device),
-                "queries": whole["queries"][:, some].to(device),
-                "distance": whole["distance"][:, some].to(device),
-            }
-            for group in optimizer.param_groups:
-                group["lr"] = _learning_rate(step, config)
-            loss, row = occupancy_loss(net, batch, config, samples.shell)
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            row["gradient"] = float(torch.nn.utils.clip_grad_norm_(net.parameters(), config.clip))
-            optimizer.step()
-            step += 1
-            rate = min(config.ema, (1 + step) / (10 + step))
-            with torch.no_grad():
-                for name, parameter in named.items():
-                    ema[name].lerp_(parameter, 1 - rate)
-            recent.append(row)
-            if step % 25 == 0:
-                mean = {key: float(np.mean([r[key] for r in recent])) for key in recent[0]}
-                mean |= {"step": step, "seconds": seconds + time.monotonic() - began}
-                log.write(json.dumps(mean) + "\n")
-                log.flush()
-                recent = []
-                if step % 100 == 0:
-                    print(
-                        f"step {step}: loss {mean['loss']:.3f}, accuracy {mean['accuracy']:.3f}, "
-                        f"{step * config.batch / mean['seconds']:.1f} clouds/s",
-                        flush=True,
-                    )
-            if step % checkpoint_every == 0:
-                write()
-    card = write()
-    final = OccupancyNet(encoder, decoder).to(device).eval()
-    final.load_state_dict(ema)
-    card["validation"] = occupancy_scores(
-        {"encoder": network_predictor(final)},
-        split="validation",
-        count=validation_count,
-        samples=samples,
-    )["encoder"]
-    save_checkpoint(output / "encoder.safetensors", ema, kind=ENCODER, card=card)
+        },
+        options=options,
+        validate=validate,
+    )
+    batches = _batches(config, samples, run, workers)
+    whole: list[Batch] = []
+    while run.goes_on():
+        use = run.step % config.uses
+        if use == 0 or not whole:
+            # Networks that samples are made with may be built here, once a process, at random.
+            with torch.random.fork_rng(devices=[]):
+                whole = [next(batches) for _ in range(config.accumulate)]
+        some = slice(use, None, config.uses)  # queries are in random order
+        count, start = _draw(whole[0]["points"].shape[1], config, run.ranks.world)
+        row = run.advance(
+            occupancy_loss(
+                net,
+                {
+                    "points": batch["points"].to(device),
+                    "queries": batch["queries"][:, some].to(device),
+                    "distance": batch["distance"][:, some].to(device),
+                },
+                config,
+                shell=samples.shell,
+                count=count,
+                start=first[run.ranks.rank].to(device),
+            )
+            for batch, first in zip(whole, start, strict=True)
+        )
+        if row and run.ranks.first and run.step % (4 * config.log_every) == 0:
+            print(
+                f"step {run.step}: loss {row['loss']:.3f}, accuracy {row['accuracy']:.3f}, "
+                f"{row['samples_per_second']:.1f} clouds/s",
+                flush=True,
+            )
+    card = run.save()
+    if run.ranks.first:
+        with torch.random.fork_rng(devices=[]):
+            card = run.save(validation=scores(run.ema))
+    run.close()
     return card
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga train encoder`."""
-    parser.add_argument("--out", type=Path, required=True, help="folder of weights, state and log")
-    parser.add_argument(
-        "--size", choices=("paper", "light"), default="paper",
-        help="1.7 M parameters as in the paper, or 0.4 M",
-    )  # fmt: skip
-    parser.add_argument(
-        "--query", choices=("position", "projections"), default=DecoderConfig.query,
-        help="what the decoder sees of a query: its position, as in the paper, or invariants",
-    )  # fmt: skip
-    parser.add_argument("--steps", type=int, default=EncoderTraining.steps)
-    parser.add_argument("--batch", type=int, default=EncoderTraining.batch, help="clouds a step")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after this long")
-    parser.add_argument("--workers", type=int, default=0, help="processes that make samples")
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch on the CPU")
+    add_run_options(parser)
     parser.add_argument("--float32", action="store_true", help="no bfloat16 autocast")
+    parser.add_argument(
+        "--size", choices=("paper", "light"),
+        help="1.7 M parameters as in the paper (default of a new run), or 0.4 M",
+    )  # fmt: skip
+    parser.add_argument(
+        "--query", choices=("position", "projections"),
+        help="what the decoder sees of a query: its position, as in the paper (default of a new "
+        "run), or invariants",
+    )  # fmt: skip
 
 
 def main(arguments: argparse.Namespace) -> int:
     """Runs the training; a run that was stopped (or killed) goes on from its last checkpoint."""
     torch.set_num_threads(arguments.threads)
-    light = arguments.size == "light"
-    card = train_encoder(
-        arguments.out,
-        encoder=EncoderConfig.light() if light else EncoderConfig(),
-        decoder=DecoderConfig(query=arguments.query, width=128 if light else 256),
-        config=EncoderTraining(
-            steps=arguments.steps,
-            batch=arguments.batch,
-            seed=arguments.seed,
-            bf16=not arguments.float32,
-        ),
-        device=arguments.device,
-        minutes=arguments.minutes,
-        workers=arguments.workers,
-    )
-    scores = card["validation"]
-    print(
-        f"step {card['step']}, {card['samples_seen']} clouds seen, {card['seconds']:.0f} s; "
-        f"validation: accuracy {scores['accuracy']:.3f}, IoU {scores['iou']:.3f}, of the volume "
-        f"{scores['iou_uniform']:.3f}"
-    )
+    settings: EncoderSettings = with_options(EncoderSettings.of(arguments.out), arguments)
+    encoder, decoder = settings.encoder, settings.decoder
+    if arguments.size:
+        light = arguments.size == "light"
+        encoder = EncoderConfig.light() if light else EncoderConfig()
+        decoder = dataclasses.replace(decoder, width=128 if light else 256)
+    if arguments.query:
+        decoder = dataclasses.replace(decoder, query=arguments.query)
+    with process_group(arguments.device) as device:
+        card = train_encoder(
+            arguments.out,
+            encoder=encoder,
+            decoder=decoder,
+            config=settings.training,
+            samples=settings.samples,
+            device=device,
+            workers=arguments.workers,
+            options=run_options(arguments),
+        )
+    if "validation" in card:
+        scores = card["validation"]
+        print(
+            f"step {card['step']}, {card['samples_seen']} clouds seen, {card['seconds']:.0f} s; "
+            f"validation: accuracy {scores['accuracy']:.3f}, IoU {scores['iou']:.3f}, of the "
+            f"volume {scores['iou_uniform']:.3f}"
+        )
     return 0

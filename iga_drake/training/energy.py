@@ -35,8 +35,8 @@ from iga_drake.geometry.se3 import geodesic_angle, random_rotations, rigid, tran
 from iga_drake.training.energy_problems import (
     ProblemMaker,
     Problems,
-    displacement,
     make_problems,
+    pose_displacements,
     random_near,
 )
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
@@ -77,14 +77,14 @@ class EnergyTraining(RunConfig):
 
 @dataclass(frozen=True)
 class EnergySettings:
-    """All that the result of a training depends on, but for the descriptors."""
+    """All settings of a training; with the descriptors they determine its result."""
 
     model: EnergyConfig
     training: EnergyTraining
 
     @staticmethod
     def of(folder: Path) -> "EnergySettings":
-        """Those of the run in this folder, else the defaults. Raises `IgaDrakeError`."""
+        """The settings of the run in this folder, else the defaults. Raises `IgaDrakeError`."""
         saved = SavedState.read(folder, KIND)
         if saved is None:
             return EnergySettings(EnergyConfig(), EnergyTraining())
@@ -135,12 +135,12 @@ def placing_loss(
     with torch.no_grad():
         pick = int(torch.randint(len(valid), (), generator=generator))
         start = random_near(valid[pick], generator, 8 * config.starts)
-        start = start[displacement(start, valid, cloud) < NEAR][: config.starts]
-        if float(displacement(voted[:1], valid, cloud)) < VOTE_NEAR:
+        start = start[pose_displacements(start, valid, cloud) < NEAR][: config.starts]
+        if float(pose_displacements(voted[:1], valid, cloud)) < VOTE_NEAR:
             start = torch.cat((start, voted[:1]))
     if not len(start):
         return energy.temperature * 0
-    off = displacement(energy.refine(start, config.refinement), valid, cloud)
+    off = pose_displacements(energy.refine(start, config.refinement), valid, cloud)
     return (off / (off + FAR)).mean() * (FAR / 0.01)
 
 
@@ -153,8 +153,11 @@ def energy_loss(
     config: EnergyTraining,
     generator: torch.Generator,
 ) -> Term:
-    """Of one problem: both terms of the loss (the cross-entropy above the least possible); energies
-    of the right pose and of the lowest wrong one, how often the right one is lower."""
+    """The loss of one problem: the placing term, and the cross-entropy above the least possible.
+
+    Statistics: both terms, the energies of the right pose and of the lowest wrong one, and how
+    often the right one is lower.
+    """
     energy = net(proposals)
     placing = placing_loss(energy, valid, voted, cloud, config, generator)
     with torch.no_grad():
@@ -166,7 +169,7 @@ def energy_loss(
             },
         )
         X = _candidates(detached, valid, config, generator)
-        off = displacement(X, valid, cloud)
+        off = pose_displacements(X, valid, cloud)
         target = (-0.5 * (off / config.target_sigma).square()).softmax(0)
     E = energy(X)
     log_share = (-E).log_softmax(0)
@@ -207,7 +210,7 @@ def energy_errors(net: PairEnergyNet, problems: Problems) -> dict[str, float]:
         with torch.no_grad():
             X, _ = minimise(net(problems.proposals(n)), also=voted)
         pair = torch.stack((X[0], voted[0]))
-        off = displacement(pair, valid, cloud)
+        off = pose_displacements(pair, valid, cloud)
         errors = []
         for Y in pair:
             ends = (transform(Z, cloud) for Z in valid)

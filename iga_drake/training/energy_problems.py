@@ -115,7 +115,7 @@ class Problems:
         return len(self.tensors["R"])
 
     def proposals(self, index: int) -> PairProposals:
-        """Of one problem; which nodes its parts are is not kept."""
+        """The proposals of one problem, without the nodes that its parts are."""
         R, place, part, there, features = (
             self.tensors[name][index] for name in ("R", "place", "part", "there", "features")
         )
@@ -123,19 +123,19 @@ class Problems:
         return PairProposals(R, place, part, unknown, there, features)
 
     def valid(self, index: int) -> Tensor:
-        """(VALID, 4, 4)."""
+        """(VALID, 4, 4) right poses of one problem."""
         return self.tensors["valid"][index]
 
     def voted(self, index: int) -> Tensor:
-        """(VOTED, 4, 4)."""
+        """(VOTED, 4, 4) modes of the vote on one problem, best first."""
         return self.tensors["voted"][index]
 
     def cloud(self, index: int) -> Tensor:
-        """(CLOUD, 3)."""
+        """(CLOUD, 3) m, points of one problem's grasped cloud."""
         return self.tensors["cloud"][index]
 
     def to(self, device: str) -> "Problems":
-        """On another device."""
+        """A copy on another device."""
         return Problems({name: x.to(device) for name, x in self.tensors.items()})
 
 
@@ -180,7 +180,7 @@ def _made(split: str, first: int, maker: ProblemMaker, workers: int) -> dict[str
     return made
 
 
-def displacement(X: Tensor, valid: Tensor, cloud: Tensor) -> Tensor:
+def pose_displacements(X: Tensor, valid: Tensor, cloud: Tensor) -> Tensor:
     """(n,) m: mean distance of a cloud's points (P, 3) under poses X (n, 4, 4) from where the
     nearest of `valid` (v, 4, 4) puts them."""
     ends, goals = (cloud @ Y[:, :3, :3].transpose(1, 2) + Y[:, None, :3, 3] for Y in (X, valid))

@@ -57,7 +57,7 @@ class TrainingLog:
 
 
 def _step(line: str) -> float:
-    """Of a line of the log; none of a line that was torn when the process was killed."""
+    """The step of a line of the log; infinite for a line that was torn by a kill."""
     try:
         return json.loads(line)["step"]
     except (ValueError, KeyError, TypeError):

@@ -7,6 +7,7 @@ bfloat16 arithmetic that takes longer than forward and backward pass of a small 
 
 from collections.abc import Callable, Iterable
 from itertools import groupby
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -28,14 +29,19 @@ def orthogonalised(matrices: Tensor, steps: int = 5) -> Tensor:
 
 
 class Muon(torch.optim.Optimizer):
-    """Of matrices alone. A step has the size of one of AdamW at the same learning rate (Liu et al.,
-    "Muon is scalable for LLM training", 2025); weight decay is decoupled.
+    """The optimizer Muon, which trains matrices alone.
+
+    A step has the size of one of AdamW at the same learning rate (Liu et al., "Muon is scalable for
+    LLM training", 2025); weight decay is decoupled.
 
     The state of each parameter is its `momentum_buffer`, as in `torch.optim.Muon`.
     """
 
-    def __init__(self, params: Iterable[nn.Parameter], lr: float, weight_decay: float):
-        """Raises `ValueError` for parameters that are no matrices."""
+    def __init__(self, params: Iterable[Any], lr: float, weight_decay: float):
+        """`params` are matrices, or groups of them as dictionaries.
+
+        Raises `ValueError` for a parameter that is no matrix.
+        """
         super().__init__(params, {"lr": lr, "weight_decay": weight_decay})
         for parameter in self._parameters():
             if parameter.ndim != 2:

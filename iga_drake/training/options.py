@@ -26,9 +26,15 @@ FIELDS: dict[str, tuple[type, str]] = {
 
 
 def add_run_options(
-    parser: argparse.ArgumentParser, fields: dict[str, tuple[type, str]] = FIELDS
+    parser: argparse.ArgumentParser,
+    fields: dict[str, tuple[type, str]] = FIELDS,
+    *,
+    workers: bool = True,
 ) -> None:
-    """Options of every training; `fields` of its settings get one each."""
+    """Adds the options of every training.
+
+    `fields` of its settings get an option each; `workers` says whether processes make samples.
+    """
     parser.add_argument("--out", type=Path, required=True, help="folder of weights, state and log")
     parser.add_argument("--config", type=Path, help="YAML file with sections of settings")
     for name, (kind, text) in fields.items():
@@ -49,13 +55,14 @@ def add_run_options(
         help="at most this long between checkpoints",
     )
     parser.add_argument("--tensorboard", action="store_true", help="TensorBoard log, too")
-    parser.add_argument("--workers", type=int, default=0, help="processes that make samples")
+    if workers:
+        parser.add_argument("--workers", type=int, default=0, help="processes that make samples")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch on the CPU")
 
 
 def run_options(arguments: argparse.Namespace) -> RunOptions:
-    """How the run goes, from parsed options."""
+    """The options of a run, from parsed arguments."""
     return RunOptions(
         minutes=arguments.minutes,
         checkpoint_every=arguments.checkpoint_every,

@@ -24,7 +24,7 @@ from iga_drake.aligners.iga.local_encoder import EncoderConfig, LocalEncoder, lo
 from iga_drake.aligners.iga_paper.graph import GraphConfig, Nodes, moved
 from iga_drake.aligners.iga_paper.langevin import LangevinConfig, haar_rotations, langevin
 from iga_drake.aligners.iga_paper.model import OUTPUTS, PaperModel, kind_of
-from iga_drake.aligners.iga_paper.nodes import Problem, encode, problem
+from iga_drake.aligners.iga_paper.nodes import PaperProblem, encode, problem
 from iga_drake.aligners.iga_paper.search import (
     DISTANCE_UNIT,
     best,
@@ -82,10 +82,10 @@ class PaperTraining(RunConfig):
     langevin_every: int = 5
     langevin_steps: int = 5
     langevin_share: float = 0.5
-    # Of the local ones this share stays wide (the paper: none).
+    # Share of the local ones that stays wide (the paper: none).
     wide_share: float = 0.0
-    # Of energies: so many poses (0: all), drawn as likely as exp(-E), carry the gradient. Its mean
-    # is that of all; the energy penalty is then on those.
+    # So many of the energies' poses (0: all), drawn as likely as exp(-E), carry the gradient. Its
+    # mean is that of all; the energy penalty is then on those.
     drawn: int = 0
     # Stabilisers; 0 leaves one out. Spectral normalisation is a field of the model.
     energy_penalty: float = 1e-3  # on the mean square of the energies
@@ -99,7 +99,7 @@ class PaperTraining(RunConfig):
     # "own": every alignment in a frame of its own, as the evaluation sets have them. "common": as
     # in the paper's data, target objects turned alike in all alignments of a sample.
     frames: str = "own"
-    # Which alignment of a sample is the test: any, drawn at every use; or always the last one, as
+    # The alignment of a sample that is the test: any, drawn at every use; or always the last, as
     # in the evaluation, which makes a fifth of the problems of a subset.
     any_test: bool = True
     turned: bool = False  # each sample as a whole, at random at every use: more data than there is
@@ -129,7 +129,7 @@ class PaperTraining(RunConfig):
 
 @dataclass(frozen=True)
 class PaperSettings:
-    """All that the result of a training depends on, but for the encoder's weights."""
+    """All settings of a training; with the encoder's weights they determine its result."""
 
     model: GraphConfig
     training: PaperTraining
@@ -137,7 +137,7 @@ class PaperSettings:
 
     @staticmethod
     def of(folder: Path, part: str, size: str = "full") -> "PaperSettings":
-        """Those of the run in this folder, else the defaults of a part and size."""
+        """The settings of the run in this folder, else the defaults of a part and size."""
         saved = SavedState.read(folder, kind_of(part))
         if saved is not None:
             return _saved_settings(saved, folder, part)
@@ -232,7 +232,7 @@ class NodeStream:
         return self._kept[index]
 
 
-def drawn_problem(nodes: Nodes, config: PaperTraining, generator: torch.Generator) -> Problem:
+def drawn_problem(nodes: Nodes, config: PaperTraining, generator: torch.Generator) -> PaperProblem:
     """One of the alignments as the test, the others as demonstrations, as `any_test` and `turned`
     of the training say."""
     S, _, N = nodes.positions.shape[:3]
@@ -262,14 +262,14 @@ def moves(
     return R, translation * uniform(S, M, 3, generator=generator, device=device)
 
 
-def right_place(asked: Problem) -> Tensor:
+def right_place(asked: PaperProblem) -> Tensor:
     """(S, 3) where A's centre belongs from B's; the right rotation is none."""
     return asked.centres[0] - asked.centres[1]
 
 
 def candidates(
     model: PaperModel,
-    asked: Problem,
+    asked: PaperProblem,
     config: PaperTraining,
     step: int,
     generator: torch.Generator,
@@ -308,7 +308,7 @@ def candidates(
     return torch.cat((none, R), 1), torch.cat((place[:, None], t), 1)
 
 
-def energy_loss(
+def info_nce_loss(
     model: PaperModel, nodes: Nodes, config: PaperTraining, step: int, generator: torch.Generator
 ) -> Term:
     """InfoNCE (paper, eq. "aprox_distribution"), summed over samples, with its penalties.
@@ -357,7 +357,7 @@ def energy_loss(
 def variant_loss(
     model: PaperModel, nodes: Nodes, config: PaperTraining, step: int, generator: torch.Generator
 ) -> Term:
-    """Of DirReg or DFM, summed over samples: half of the poses wide, half local."""
+    """The loss of DirReg or DFM, summed over samples: half of the poses wide, half local."""
     asked = drawn_problem(nodes, config, generator)
     place = right_place(asked)
     S, M = len(place), config.candidates
@@ -409,7 +409,7 @@ def part_errors(
     count: int = 8,
     samples: SampleConfig | None = None,
 ) -> dict[str, float]:
-    """What a part is off by after its search, modulo symmetry, over samples of a set.
+    """Errors of a part after its search, modulo symmetry, over samples of a set.
 
     Rotations are searched at the demonstrations' mean offset, translations at the right rotation:
     means and medians of degrees or centimetres; of the variants both, and first the mean
@@ -460,7 +460,7 @@ def part_errors(
     return result
 
 
-def _motion(asked: Problem, R: Tensor, t: Tensor, turn: np.ndarray) -> np.ndarray:
+def _motion(asked: PaperProblem, R: Tensor, t: Tensor, turn: np.ndarray) -> np.ndarray:
     """(4, 4) in W by which a pose moves A away from its place there; `turn` (3, 3) from W."""
     c_A, c_B = (c[0].double().cpu().numpy() for c in asked.centres)
     rotation = R.double().cpu().numpy()
@@ -487,7 +487,7 @@ def _validation_errors(
 
 
 def _generator(config: PaperTraining, number: int, device: torch.device | str) -> torch.Generator:
-    """Of the random choices of one forward pass, whatever process makes it."""
+    """Random generator of one forward pass, the same whatever process makes it."""
     seed = (config.seed * 2**32 + number) % 2**62
     return torch.Generator(device).manual_seed(seed)
 
@@ -566,7 +566,7 @@ def train_paper(
         first=config.seed * SEED_STRIDE + seen + run.samples_seen,
         rank=ranks.rank, world=ranks.world, workers=workers, device=device,
     )  # fmt: skip
-    loss = energy_loss if part in ENERGIES else variant_loss
+    loss = info_nce_loss if part in ENERGIES else variant_loss
     while run.goes_on():
         net.graph.power_iteration()
         first = run.step * config.accumulate

@@ -14,7 +14,7 @@ TIMEOUT = timedelta(hours=1)
 
 
 def launched() -> int:
-    """How many processes torchrun has started for this training; 1 without it."""
+    """Number of processes that torchrun has started for this training; 1 without it."""
     return int(os.environ.get("WORLD_SIZE", "1")) if "RANK" in os.environ else 1
 
 
@@ -35,7 +35,7 @@ def process_group(device: str) -> Iterator[str]:
 
 
 class Ranks:
-    """What the processes of a training tell each other."""
+    """Communication among the processes of a training."""
 
     def __init__(self, device: torch.device | str):
         self._device = device

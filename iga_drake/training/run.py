@@ -1,4 +1,4 @@
-"""What every training shares: schedule, steps, averaged weights, checkpoints, log, resuming.
+"""The run that all trainings share: schedule, steps, averaged weights, checkpoints, log, resuming.
 
 The gradient of a step is that of the mean over all items (matches, poses) of all samples of the
 step. Forward passes therefore give sums over items with their counts; gradients and counts are
@@ -11,9 +11,10 @@ import math
 import os
 import subprocess
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -27,7 +28,6 @@ from iga_drake.training.settings import TrainingError
 
 DECAYS = ("linear", "cosine")
 OPTIMIZERS = ("adamw", "muon")
-BETAS = (0.9, 0.98)
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,13 @@ class RunConfig:
     # orthogonal, at steps of AdamW's size, and all else by AdamW.
     optimizer: str = "adamw"
     learning_rate: float = 1.5e-3
+    betas: tuple[float, float] = (0.9, 0.98)  # of AdamW's moments
     warmup: int = 150
     decay_share: float = 0.35  # of the steps, at the end
     decay: str = "linear"  # to zero; or cosine
     weight_decay: float = 0.02
     clip: float = 1.0  # norm of the gradient
-    ema: float = 0.998
+    ema: float = 0.998  # decay of the averaged weights; 0: they are the weights themselves
     bf16: bool = True  # autocast of the matrix products
     seed: int = 0
     log_every: int = 25  # steps
@@ -75,7 +76,7 @@ class Term:
 
 @dataclass(frozen=True)
 class SavedState:
-    """All that resuming needs."""
+    """Tensors and card from which a run resumes."""
 
     tensors: dict[str, Tensor]
     card: dict
@@ -89,7 +90,7 @@ class SavedState:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run goes that doesn't change its result."""
+    """Options of a run that don't change its result."""
 
     minutes: float = math.inf  # stop after this long
     stop_at: int | None = None  # or after this step
@@ -102,7 +103,7 @@ class RunOptions:
 
 
 def learning_rate(step: int, config: RunConfig) -> float:
-    """Of a step counted from 0: linear warm-up, constant, decay to zero."""
+    """The rate at a step counted from 0: linear warm-up, constant, decay to 2 % of the highest."""
     left = min(1.0, (config.steps - step) / max(1, int(config.decay_share * config.steps)))
     if config.decay == "cosine":
         left = (1 - math.cos(math.pi * left)) / 2
@@ -110,17 +111,28 @@ def learning_rate(step: int, config: RunConfig) -> float:
 
 
 def make_optimizers(
-    parameters: Iterable[nn.Parameter], config: RunConfig
+    named: Mapping[str, nn.Parameter], config: RunConfig, rate_factors: Mapping[str, float]
 ) -> list[torch.optim.Optimizer]:
-    """Those that together make a step."""
+    """The optimizers that together make a step.
+
+    `rate_factors` are learning rates of parameters by name, relative to all others'.
+    """
     rate, decay = config.learning_rate, config.weight_decay
-    parameters = list(parameters)
+
+    def groups(chosen: Iterable[str]) -> list[dict[str, Any]]:
+        of_factor: dict[float, list[nn.Parameter]] = {1.0: []}
+        for name in chosen:
+            of_factor.setdefault(rate_factors.get(name, 1.0), []).append(named[name])
+        return [{"params": p, "factor": factor} for factor, p in of_factor.items() if p]
+
+    def adamw(chosen: Iterable[str]) -> torch.optim.Optimizer:
+        return torch.optim.AdamW(groups(chosen), lr=rate, weight_decay=decay, betas=config.betas)
+
     if config.optimizer == "adamw":
-        return [torch.optim.AdamW(parameters, lr=rate, weight_decay=decay, betas=BETAS)]
-    matrices = [p for p in parameters if p.ndim == 2]
-    others = [p for p in parameters if p.ndim != 2]
-    muon = Muon(matrices, lr=rate, weight_decay=decay)
-    return [muon, torch.optim.AdamW(others, lr=rate, weight_decay=decay, betas=BETAS)]
+        return [adamw(named)]
+    matrices = [name for name, p in named.items() if p.ndim == 2]
+    others = [name for name, p in named.items() if p.ndim != 2]
+    return [Muon(groups(matrices), lr=rate, weight_decay=decay), adamw(others)]
 
 
 class TrainingRun:
@@ -143,9 +155,22 @@ class TrainingRun:
         card: dict,
         options: RunOptions | None = None,
         validate: Callable[[dict[str, Tensor]], dict[str, float]] | None = None,
+        rate_factors: Mapping[str, float] | None = None,
     ):
-        """`card` describes the run in its checkpoints. `validate` measures EMA weights (of the CPU)
-        with errors by name; the first one chooses the best. Raises `TrainingError`."""
+        """Starts the run, or resumes it from `saved`. Raises `TrainingError`.
+
+        Args:
+          folder: where the files are written.
+          kind: of the checkpoints, and the name of the weights' file.
+          net: on the device that it trains on.
+          config: saved in the card under "training".
+          saved: the folder's state, if there is one.
+          card: describes the run in its checkpoints.
+          options: how it goes.
+          validate: measures EMA weights (on the CPU): errors by name, the first of which chooses
+            the best weights.
+          rate_factors: learning rates of parameters by name, relative to all others'.
+        """
         self.net, self.config = net, config
         self.step, self.samples_seen, self._seconds = 0, 0, 0.0
         self._folder, self._kind, self._card = folder, kind, card
@@ -153,7 +178,7 @@ class TrainingRun:
         self._named = dict(net.named_parameters())
         self._device = next(net.parameters()).device
         self.ranks = Ranks(self._device)
-        self._optimizers = make_optimizers(net.parameters(), config)
+        self._optimizers = make_optimizers(self._named, config, rate_factors or {})
         # Sums of the statistics since the last row of the log, and their number.
         self._sums: dict[str, Tensor] = {}
         self._summed = 0
@@ -207,14 +232,14 @@ class TrainingRun:
         return self.config.optimizer == "muon" and parameter.ndim == 2
 
     def _state_of(self, parameter: nn.Parameter) -> dict:
-        """The optimizer's, to read or fill."""
+        """The optimizer's state of a parameter, to read or fill."""
         return self._optimizers[
             0 if self.config.optimizer == "adamw" or self._by_muon(parameter) else 1
         ].state[parameter]
 
     @property
     def seconds(self) -> float:
-        """Since the training began, without pauses."""
+        """Seconds since the training began, without pauses."""
         return self._seconds + time.monotonic() - self._began
 
     @property
@@ -236,7 +261,7 @@ class TrainingRun:
         rate = learning_rate(self.step, self.config)
         for optimizer in self._optimizers:
             for group in optimizer.param_groups:
-                group["lr"] = rate
+                group["lr"] = group["factor"] * rate
             optimizer.zero_grad(set_to_none=True)
         sums: dict[str, Tensor] = {}
         for term in terms:

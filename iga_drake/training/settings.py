@@ -58,7 +58,12 @@ def read_settings(path: Path, sections: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _typed(value: Any, kind: Any, where: str) -> Any:
-    """`value` as a field's type: bool, int, float, str or a tuple of such."""
+    """`value` as a field's type: bool, int, float, str, one of some values, or a tuple of such."""
+    if typing.get_origin(kind) is typing.Literal:
+        if value in typing.get_args(kind):
+            return value
+        allowed = ", ".join(map(str, typing.get_args(kind)))
+        raise TrainingError(f"{where}: '{value}' must be one of: {allowed}")
     if typing.get_origin(kind) is tuple:
         kinds = typing.get_args(kind)
         if isinstance(value, list | tuple):

@@ -24,8 +24,9 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraInfo, ImageIo, ImageRgb8U
 
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.families import FAMILIES
-from iga_drake.shapes.instance import ShapeError, ShapeInstance
+from iga_drake.shapes.instance import ShapeInstance
 
 # One light tint a part label, in turn.
 TINTS = (

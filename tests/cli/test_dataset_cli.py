@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from iga_drake.cli import dataset
-from iga_drake.dataset.export import digest, read_shard, set_digest
+from iga_drake.dataset.export import read_shard, sample_digest, set_digest
 from iga_drake.dataset.samples import make_sample
 from iga_drake.errors import IgaDrakeError
 
@@ -27,7 +27,9 @@ def test_export_writes_the_set_s_samples_and_resumes(
     assert capsys.readouterr().out == (f"{manifest}: 3 samples of 'easy', 2 shards made, 0 kept\n")
     shards = json.loads(manifest.read_text())["shards"]
     found = [sample for shard in shards for sample in read_shard(tmp_path / shard["file"])]
-    assert [digest(s) for s in found] == [digest(make_sample("easy", k)) for k in range(3)]
+    assert [sample_digest(s) for s in found] == [
+        sample_digest(make_sample("easy", k)) for k in range(3)
+    ]
     assert run(*options, "--count", "3") == 0
     assert "0 shards made, 2 kept" in capsys.readouterr().out
 

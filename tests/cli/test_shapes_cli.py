@@ -10,8 +10,8 @@ import pytest
 import trimesh
 
 from iga_drake.cli import shapes
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.families import FAMILIES
-from iga_drake.shapes.instance import ShapeError
 
 
 def run(*arguments: str) -> int:

@@ -9,7 +9,7 @@ import trimesh
 from iga_drake.dataset.collections import collection_keys, collection_mesh
 from iga_drake.dataset.oracle import oracle_pose
 from iga_drake.dataset.samples import SampleConfig, make_sample
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.readers import split_of
 
 

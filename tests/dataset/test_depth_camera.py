@@ -7,17 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from iga_drake.dataset.depth_camera import (
-    CameraError,
-    DepthNoise,
-    observe,
-    visible,
-    voxel_indices,
-)
+from iga_drake.dataset.depth_camera import CameraError, observe, random_voxel_indices, visible
+from iga_drake.dataset.depth_noise import DepthNoise
 
 NO_ERROR = DepthNoise(
-    disparity=0, patch_disparity=0, quantum=1e-6, grazing=(-0.9, -1.0), edge_lost=0, edge_flying=0,
-    calibration=0,
+    disparity=0, patch_disparity=0, quantum=1e-6, grazing_kept=-0.9, grazing_lost=-1.0, edge_lost=0,
+    edge_flying=0,
 )  # fmt: skip
 
 
@@ -118,8 +113,9 @@ def test_exact_observation_is_a_choice_of_visible_samples() -> None:
     seen = visible(*arguments, spacing=spacing)[0, :, 0].any(0)
     for noise, tolerance in ((None, 1e-7), (NO_ERROR, 1e-5)):
         clouds = observe(
-            *arguments, spacing=spacing, voxel=0.005, count=256, noise=noise, generator=_generator()
-        )
+            *arguments, spacing=spacing, voxel=0.005, count=256, noise=noise, calibration=0.0,
+            generator=_generator(),
+        )  # fmt: skip
         index = clouds.index[0, 0]
         assert seen[index].all()
         assert (clouds.points[0, 0] - points[index]).abs().max() <= tolerance
@@ -149,7 +145,7 @@ def test_few_points_repeat_evenly_and_nothing_seen_is_zero() -> None:
         assert not clouds.points[empty].any() and not clouds.index[empty].any()
 
 
-def _plate_depths(noise: DepthNoise, z: float) -> np.ndarray:
+def _plate_depths(noise: DepthNoise, z: float, calibration: float = 0.0) -> np.ndarray:
     """Measured depths of a plate across the optical axis at z, by many cameras."""
     u = torch.rand(1500, 2, generator=_generator(3)) * 0.2 - 0.1
     points = torch.cat((u, torch.zeros(1500, 1)), 1)[None, None]
@@ -158,7 +154,8 @@ def _plate_depths(noise: DepthNoise, z: float) -> np.ndarray:
     for seed in range(20):
         clouds = observe(
             points, normals, torch.tensor([[[0.0, 0.0, z]]]),
-            spacing=0.005, voxel=1e-4, count=1000, noise=noise, generator=_generator(seed),
+            spacing=0.005, voxel=1e-4, count=1000, noise=noise, calibration=calibration,
+            generator=_generator(seed),
         )  # fmt: skip
         depths.append(z - clouds.points[0, 0, :, 2].numpy())
     return np.stack(depths)
@@ -167,8 +164,7 @@ def _plate_depths(noise: DepthNoise, z: float) -> np.ndarray:
 @pytest.mark.parametrize("z", [0.5, 1.0])
 def test_depth_error_is_that_of_the_disparity(z: float) -> None:
     noise = DepthNoise(
-        disparity=0.05, patch_disparity=0.05, quantum=1e-6, calibration=0, edge_lost=0,
-        edge_flying=0,
+        disparity=0.05, patch_disparity=0.05, quantum=1e-6, edge_lost=0, edge_flying=0
     )  # fmt: skip
     error = _plate_depths(noise, z) - z
     assert error.std() == pytest.approx(z * z * math.hypot(0.05, 0.05) / 33.8, rel=0.05)
@@ -176,14 +172,14 @@ def test_depth_error_is_that_of_the_disparity(z: float) -> None:
 
 
 def test_disparity_is_quantised() -> None:
-    noise = DepthNoise(patch_disparity=0, calibration=0, edge_lost=0, edge_flying=0)
+    noise = DepthNoise(patch_disparity=0, edge_lost=0, edge_flying=0)
     steps = 33.8 / _plate_depths(noise, 0.8) * 32
     assert np.abs(steps - np.round(steps)).max() < 0.02
     assert len(np.unique(np.round(steps))) > 5
 
 
 def test_a_camera_is_misplaced_as_a_whole() -> None:
-    depth = _plate_depths(dataclasses.replace(NO_ERROR, calibration=0.002), 0.8)
+    depth = _plate_depths(NO_ERROR, 0.8, calibration=0.002)
     assert depth.std(1).max() < 1e-5
     assert 0.001 < depth.mean(1).std() < 0.003
 
@@ -195,7 +191,7 @@ def test_grazing_surfaces_and_edges_are_lost_and_some_edge_points_fly() -> None:
     def look(noise: DepthNoise) -> tuple[torch.Tensor, torch.Tensor]:
         clouds = observe(
             *scene, spacing=_ball_spacing(2000, 0.1), voxel=1e-4, count=2000, noise=noise,
-            generator=_generator(),
+            calibration=0.0, generator=_generator(),
         )  # fmt: skip
         index, first = np.unique(clouds.index.numpy(), return_index=True)
         return torch.from_numpy(index), clouds.points[0, 0][torch.from_numpy(first)]
@@ -204,7 +200,7 @@ def test_grazing_surfaces_and_edges_are_lost_and_some_edge_points_fly() -> None:
     cosine = -(rays * normals).sum(1) / rays.norm(dim=1)
     everything, _ = look(NO_ERROR)
     assert (cosine[everything] < 0.1).any()
-    kept, _ = look(dataclasses.replace(NO_ERROR, grazing=(0.5, 0.2)))
+    kept, _ = look(dataclasses.replace(NO_ERROR, grazing_kept=0.5, grazing_lost=0.2))
     assert cosine[kept].min() >= 0.2
     assert set(everything[cosine[everything] > 0.5].tolist()) <= set(kept.tolist())
     kept, _ = look(dataclasses.replace(NO_ERROR, edge_lost=1.0))
@@ -233,14 +229,14 @@ def test_the_generator_decides_everything() -> None:
 def test_one_point_of_every_voxel_of_every_cloud() -> None:
     points = torch.randn(5000, 3, generator=_generator()) * 0.03
     cloud = torch.randint(4, (5000,), generator=_generator(1))
-    index = voxel_indices(points, cloud, 0.01, _generator(2))
+    index = random_voxel_indices(points, cloud, 0.01, _generator(2))
     key = torch.cat((cloud[:, None], torch.floor(points / 0.01).long()), 1).numpy()
     assert len(np.unique(key[index], axis=0)) == len(index) == len(np.unique(key, axis=0))
     assert (cloud[index].diff() >= 0).all()
     # Each point of a voxel is as likely as another.
     two = torch.tensor([[0.001, 0, 0], [0.002, 0, 0]])
     one = torch.zeros(2, dtype=torch.int64)
-    drawn = [int(voxel_indices(two, one, 0.01, _generator(k))[0]) for k in range(200)]
+    drawn = [int(random_voxel_indices(two, one, 0.01, _generator(k))[0]) for k in range(200)]
     assert 70 < sum(drawn) < 130
 
 

@@ -10,7 +10,13 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from iga_drake.dataset import export
-from iga_drake.dataset.export import ExportError, digest, export_shards, read_shard, set_digest
+from iga_drake.dataset.export import (
+    ExportError,
+    export_shards,
+    read_shard,
+    sample_digest,
+    set_digest,
+)
 from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.dataset.splits import SplitError
 
@@ -39,7 +45,7 @@ def test_shards_hold_the_samples_exactly(local: Path) -> None:
         for field in dataclasses.fields(expected):
             value = getattr(expected, field.name)
             np.testing.assert_array_equal(getattr(sample, field.name), value)
-        assert digest(sample) == digest(expected)
+        assert sample_digest(sample) == sample_digest(expected)
         assert sample.category == expected.category
 
 
@@ -58,12 +64,12 @@ def test_the_format_is_open(local: Path) -> None:
 
 def test_digests_tell_samples_apart_and_add_up() -> None:
     a, b = make_sample("train", 0, SMALL), make_sample("train", 1, SMALL)
-    assert digest(a) == digest(make_sample("train", 0, SMALL)) != digest(b)
+    assert sample_digest(a) == sample_digest(make_sample("train", 0, SMALL)) != sample_digest(b)
     points = a.points.copy()
     points[0, 0, 0, 0] = np.nextafter(points[0, 0, 0, 0], np.float32(9))
-    assert digest(dataclasses.replace(a, points=points)) != digest(a)
-    assert digest(dataclasses.replace(a, category=("mug", "other"))) != digest(a)
-    both = hashlib.sha256((digest(a) + digest(b)).encode()).hexdigest()
+    assert sample_digest(dataclasses.replace(a, points=points)) != sample_digest(a)
+    assert sample_digest(dataclasses.replace(a, category=("mug", "other"))) != sample_digest(a)
+    both = hashlib.sha256((sample_digest(a) + sample_digest(b)).encode()).hexdigest()
     assert set_digest("train", 2, config=SMALL) == both
     assert set_digest("train", 2, config=SMALL, workers=2) == both
     assert set_digest("train", 1, first=1, config=SMALL) != both

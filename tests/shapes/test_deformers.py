@@ -11,9 +11,9 @@ from iga_drake.shapes.deformers import (
     PartDeformer,
     ReinstancingDeformer,
 )
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.family import Draft, Family, Part
-from iga_drake.shapes.instance import ShapeError
-from iga_drake.shapes.surfaces import Surface, ellipsoid, join, rounded_box, transform
+from iga_drake.shapes.surfaces import Surface, ellipsoid, join, rounded_box, transformed
 
 
 def _at(*place: float) -> np.ndarray:
@@ -26,7 +26,7 @@ def _hammer(parameters=None) -> list[Surface]:
     length = 0.2 if parameters is None else parameters["length"]
     return [
         rounded_box((0.02, 0.02, length), radius=0.004, flat=8),
-        transform(rounded_box((0.08, 0.03, 0.03), radius=0.005), _at(0, 0, length / 2)),
+        transformed(rounded_box((0.08, 0.03, 0.03), radius=0.005), _at(0, 0, length / 2)),
     ]
 
 

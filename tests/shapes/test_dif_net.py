@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch.func import jacrev, vmap
 
 from iga_drake.checkpoint import CheckpointError, save_checkpoint
-from iga_drake.shapes.deformers.dif_net import DifNetDeformer, default_weights
+from iga_drake.shapes.deformers.dif_net import DifNetDeformer, default_dif_net_weights
 from iga_drake.shapes.deformers.protocol import DeformableShape, PointDeformer
 from iga_drake.shapes.dif_net import (
     KIND,
@@ -21,7 +21,7 @@ from iga_drake.shapes.dif_net import (
     siren,
     siren_jacobian,
 )
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.surfaces import ellipsoid, rounded_box
 
 SMALL = DifNetConfig(latent=8, width=16, hidden=2, template_width=16, template_hidden=2)
@@ -212,7 +212,7 @@ def test_weights_are_read_back_and_wrong_ones_refused(tmp_path: Path) -> None:
 
 def test_the_packages_weights_deform_a_ball_smoothly_and_each_seed_otherwise() -> None:
     """Of shapes that are no chairs: volumes stay positive, nothing folds, instances differ."""
-    assert default_weights().is_file()
+    assert default_dif_net_weights().is_file()
     surface = ellipsoid((0.05, 0.05, 0.1))
     turned = surface.vertices @ Rotation.from_euler("y", 0.4).as_matrix().T
     shape = DeformableShape(turned, surface.faces)

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from iga_drake.shapes import surfaces
-from iga_drake.shapes.instance import ShapeError, ShapeInstance, frame
+from iga_drake.shapes.errors import ShapeError
+from iga_drake.shapes.families import FAMILIES
+from iga_drake.shapes.instance import ShapeInstance, frame
+from iga_drake.shapes.symmetry import NO_SYMMETRY, Symmetry
 
 
 def _box(density: float = 500.0, offset: float = 0.0) -> ShapeInstance:
@@ -39,6 +42,16 @@ def test_with_mass_scales_mass_and_inertia() -> None:
     np.testing.assert_allclose(
         heavy.mass_properties.I_CcmO, 2 * light.mass_properties.I_CcmO, atol=1e-12
     )
+
+
+def test_symmetry_is_the_family_s_and_stays_through_changes_of_mass() -> None:
+    assert _box().symmetry == NO_SYMMETRY
+    quarter_turns = Symmetry("z", 4)
+    turned = dataclasses.replace(_box(), symmetry=quarter_turns)
+    assert turned.with_mass(2.0).symmetry == quarter_turns
+    for family in FAMILIES.values():
+        parameters = {name: sum(limits) / 2 for name, limits in family.ranges.items()}
+        assert family.build(parameters).symmetry == family.symmetry
 
 
 @pytest.mark.parametrize(

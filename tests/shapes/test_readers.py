@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.mesh_cleaning import MeshCleaning, MeshError, clean_mesh, is_solid
 from iga_drake.shapes.readers import (
     MeshEntry,

@@ -16,8 +16,9 @@ from pydrake.multibody.plant import (
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.families import FAMILIES, bowl, pan
-from iga_drake.shapes.instance import ShapeError, ShapeInstance
+from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf, write_sdf_file
 
 

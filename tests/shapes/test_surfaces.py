@@ -7,7 +7,7 @@ from scipy.interpolate import BSpline
 from scipy.spatial import ConvexHull, Delaunay
 
 from iga_drake.shapes import surfaces
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 
 ANGLE = np.linspace(0, 2 * np.pi, 24, endpoint=False)
 CIRCLE = np.stack([np.cos(ANGLE), np.sin(ANGLE), 0 * ANGLE], axis=1)

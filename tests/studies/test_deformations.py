@@ -9,8 +9,8 @@ import torch
 from iga_drake.shapes.deformers import LatticeDeformer
 from iga_drake.shapes.deformers.dif_net import DifNetDeformer
 from iga_drake.shapes.dif_net import DifNet, DifNetConfig
-from iga_drake.shapes.instance import ShapeError
-from iga_drake.shapes.surfaces import ellipsoid, join, transform
+from iga_drake.shapes.errors import ShapeError
+from iga_drake.shapes.surfaces import ellipsoid, join, transformed
 from iga_drake.studies.deformations import (
     correspondence_errors,
     crossings,
@@ -47,7 +47,7 @@ def test_a_pole_pushed_through_the_other_side_crosses_it() -> None:
 def test_parts_that_overlap_do_not_count_as_crossed() -> None:
     ball, X = ellipsoid((1.0, 1.0, 1.0)), np.eye(4)
     X[0, 3] = 1.0
-    both, _ = join([ball, transform(ball, X)])
+    both, _ = join([ball, transformed(ball, X)])
     assert not crossings(both.vertices, both.faces)
 
 

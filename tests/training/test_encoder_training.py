@@ -3,14 +3,18 @@
 import argparse
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from descriptor_runs import assert_same
 
 from iga_drake.aligners.iga.local_encoder import ENCODER, DecoderConfig, EncoderConfig, load_encoder
 from iga_drake.checkpoint import load_checkpoint
 from iga_drake.dataset.occupancy import OccupancyConfig, make_occupancy_sample
 from iga_drake.paths import models_dir
+from iga_drake.training import encoder
 from iga_drake.training.encoder import (
+    EncoderSettings,
     EncoderTraining,
     add_arguments,
     always_occupied,
@@ -20,6 +24,8 @@ from iga_drake.training.encoder import (
     point_baseline,
     train_encoder,
 )
+from iga_drake.training.run import RunOptions
+from iga_drake.training.settings import TrainingError
 
 MODEL = EncoderConfig(channels=24, scalars=16, layers=3, point_layers=2)
 DECODER = DecoderConfig(query="projections", width=32, blocks=1, frequencies=6)
@@ -28,30 +34,59 @@ SAMPLES = OccupancyConfig(cloud_points=96, camera_points=500, least_seen=16, que
 
 def _config(steps: int, **changes) -> EncoderTraining:
     changes = {"batch": 2, "uses": 3, "warmup": 2, "bf16": False, "centres": (4, 8)} | changes
-    return EncoderTraining(steps=steps, **changes)
+    return EncoderTraining(steps=steps, **{"validation_samples": 2} | changes)
 
 
 def _train(folder: Path, config: EncoderTraining, **options) -> dict:
-    options.setdefault("validation_count", 2)
     return train_encoder(
-        folder, encoder=MODEL, decoder=DECODER, config=config, samples=SAMPLES, **options
+        folder,
+        encoder=MODEL,
+        decoder=DECODER,
+        config=config,
+        samples=SAMPLES,
+        options=RunOptions(**options),
     )
 
 
 def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
     card = _train(tmp_path / "whole", _config(8))
-    assert card["samples_seen"] == 6
+    assert card["samples_seen"] == 16
     # As a kill would leave it: stopped within the uses of a batch, at step 4 of 8.
     _train(tmp_path / "half", _config(8), stop_at=4)
-    resumed = train_encoder(tmp_path / "half", config=_config(8), validation_count=2)
-    assert resumed["validation"] == card["validation"] and resumed["encoder"] == card["encoder"]
-    states = [
-        load_checkpoint(tmp_path / name / "state.safetensors", kind=ENCODER + "-state")[0]
-        for name in ("whole", "half")
-    ]
-    assert states[0].keys() == states[1].keys()
-    for name in states[0]:
-        torch.testing.assert_close(states[1][name], states[0][name], atol=0, rtol=0)
+    resumed = train_encoder(tmp_path / "half")
+    for name in ("validation", "encoder", "training", "samples"):
+        assert resumed[name] == card[name]
+    assert EncoderSettings.of(tmp_path / "half") == EncoderSettings(
+        MODEL, DECODER, _config(8), SAMPLES
+    )
+    assert_same(
+        *(
+            load_checkpoint(tmp_path / name / "state.safetensors", kind=ENCODER + "-state")[0]
+            for name in ("whole", "half")
+        )
+    )
+    with pytest.raises(TrainingError, match=r"state\.safetensors: has another model"):
+        train_encoder(tmp_path / "half", encoder=EncoderConfig())
+
+
+def test_a_batch_serves_several_steps_and_the_next_ones_follow_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clouds: list[torch.Tensor] = []
+    real = encoder.occupancy_loss
+
+    def loss(net, batch, *arguments, **options):
+        clouds.append(batch["points"])
+        assert batch["queries"].shape[1] in (133, 134)  # a third of 400
+        return real(net, batch, *arguments, **options)
+
+    monkeypatch.setattr(encoder, "occupancy_loss", loss)
+    _train(tmp_path, _config(8), stop_at=4)
+    train_encoder(tmp_path)
+    expected = [make_occupancy_sample("train", index, SAMPLES).points for index in range(6)]
+    for step, points in enumerate(clouds):
+        first = step // 3 * 2
+        np.testing.assert_array_equal(points, np.stack(expected[first : first + 2]))
 
 
 def test_training_tells_more_than_the_distance_from_the_centres(tmp_path: Path) -> None:
@@ -106,8 +141,17 @@ def test_scores_are_those_counted_by_hand() -> None:
     assert scores["all"]["iou"] == pytest.approx(true.mean())
 
 
-def test_the_command_s_options_have_the_paper_s_defaults() -> None:
+def test_the_command_trains_the_paper_s_sizes_by_default(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    arguments = parser.parse_args(["--out", "x"])
-    assert (arguments.size, arguments.query) == ("paper", "position")
+    asked: dict = {}
+    monkeypatch.setattr(encoder, "train_encoder", lambda folder, **given: asked.update(given) or {})
+    assert encoder.main(parser.parse_args(["--out", str(tmp_path), "--steps", "7"])) == 0
+    assert asked["encoder"] == EncoderConfig() and asked["decoder"] == DecoderConfig()
+    assert asked["config"] == EncoderTraining(steps=7)
+    light = ["--out", str(tmp_path), "--size", "light", "--query", "projections", "--float32"]
+    encoder.main(parser.parse_args(light))
+    assert asked["encoder"] == EncoderConfig.light() and not asked["config"].bf16
+    assert asked["decoder"] == DecoderConfig(query="projections", width=128)

@@ -17,8 +17,8 @@ from iga_drake.training.energy import EnergyTraining, fit_familiarity, train_ene
 from iga_drake.training.energy_problems import (
     ProblemMaker,
     Problems,
-    displacement,
     make_problems,
+    pose_displacements,
     random_near,
 )
 from iga_drake.training.run import RunOptions, SavedState
@@ -93,7 +93,7 @@ def test_displacements_are_those_of_the_evaluation() -> None:
     cloud = rng.normal(size=(32, 3)) * 0.1
     poses = [alignment_error.random_pose(k) for k in range(5)]
     valid = np.stack([alignment_error.random_pose(10 + k) for k in range(3)])
-    ours = displacement(
+    ours = pose_displacements(
         torch.from_numpy(np.stack(poses)), torch.from_numpy(valid), torch.from_numpy(cloud)
     )
     for X, found in zip(poses, ours.tolist(), strict=True):

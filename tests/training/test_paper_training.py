@@ -28,7 +28,7 @@ from iga_drake.training.paper import (
     candidates,
     common_turns,
     drawn_problem,
-    energy_loss,
+    info_nce_loss,
     moves,
     nodes_of,
     part_errors,
@@ -143,7 +143,7 @@ def test_info_nce_of_known_energies(monkeypatch) -> None:
     E = torch.tensor([[1.0, 2.0, 0.5], [0.0, 3.0, 3.0]])
     monkeypatch.setattr(model.graph, "forward", lambda *a: E[..., None])
     config = _config(candidates=2, gradient_penalty=0.0, energy_penalty=0.1)
-    term = energy_loss(model, nodes(2, 2, 4), config, 0, _generator())
+    term = info_nce_loss(model, nodes(2, 2, 4), config, 0, _generator())
     share = [math.exp(-r[0]) / sum(math.exp(-e) for e in r) for r in E.tolist()]
     squares = (1 + 4 + 0.25 + 0 + 9 + 9) / 3
     expected = -sum(math.log(s) for s in share) + 0.1 * squares
@@ -162,7 +162,7 @@ def test_drawn_candidates_give_the_same_loss_and_on_average_its_gradient() -> No
 
     def gradient(**changes) -> tuple[float, torch.Tensor]:
         chosen = dataclasses.replace(config, **changes)
-        total = energy_loss(model, some, chosen, 0, _generator()).total
+        total = info_nce_loss(model, some, chosen, 0, _generator()).total
         found = torch.autograd.grad(total, weights, allow_unused=True)
         return total.item(), torch.cat([g.flatten() for g in found if g is not None])
 
@@ -181,7 +181,7 @@ def test_the_gradient_penalty_makes_edges_matter_less() -> None:
 
     def both(**changes):
         chosen = dataclasses.replace(config, **changes)
-        return energy_loss(model, some, chosen, 0, _generator())
+        return info_nce_loss(model, some, chosen, 0, _generator())
 
     with_, without = both(), both(gradient_penalty=0.0)
     penalty = with_.total - without.total
@@ -229,7 +229,7 @@ def test_mixed_precision_changes_little(part: str, monkeypatch) -> None:
     monkeypatch.setattr(precision, "_processor_has_bfloat16", lambda: True)
     model, some = _model(part), nodes(2, 2, 4)
     some = Nodes(some.positions + 0.5, some.vectors)
-    loss = energy_loss if part in paper.ENERGIES else variant_loss
+    loss = info_nce_loss if part in paper.ENERGIES else variant_loss
     terms = [
         loss(model, some, _config(bf16=bf16, wide_steps=9), 0, _generator())
         for bf16 in (False, True)
@@ -477,5 +477,5 @@ def test_landed_rotation_networks_know_right_rotations(
     losses = []
     for index in range(16):
         some, _ = nodes_of(collate([make_sample(split, index)]), landed, "common", "cpu")
-        losses.append(energy_loss(landed, some, config, 0, _generator()).statistics["nce"])
+        losses.append(info_nce_loss(landed, some, config, 0, _generator()).statistics["nce"])
     assert torch.stack(losses).mean() < most

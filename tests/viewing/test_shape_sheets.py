@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from pydrake.systems.sensors import ImageIo
 
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.families import FAMILIES
-from iga_drake.shapes.instance import ShapeError
 from iga_drake.viewing.shape_sheets import (
     canonical_colors,
     contact_sheet,

@@ -30,13 +30,13 @@ RANKINGS = ("vote", "energy")
 
 @dataclass(frozen=True)
 class IgaConfig:
-    """How the aligner looks at clouds."""
+    """Options of the aligner."""
 
     # Points of a cloud that are used (drawn without repetition where there are more).
     points: int = 512
     # Nodes with descriptors per object; at most the distinct points of the smallest cloud.
     nodes: int = 96
-    # What places and ranks the poses: the vote's agreement, or the learned energy.
+    # Places and ranks the poses: "vote" (its agreement), or "energy" (the learned one).
     ranking: str = "vote"
     # Modes below this share of the best one's probability are left out.
     minimum_probability: float = 0.01
@@ -44,7 +44,7 @@ class IgaConfig:
 
 @dataclass(frozen=True)
 class Explanation:
-    """How an estimate came about, for pictures and diagnosis.
+    """An estimate with its intermediate results, for pictures and diagnosis.
 
     Role 0 is the grasped object, 1 the target; of D + 1 clouds of each the test cloud is the last.
     """
@@ -58,7 +58,7 @@ class Explanation:
     matches: tuple[list[Match], list[Match]]  # test nodes about their cloud's centroid
     proposals: tuple[int, int, int]  # pairs of parts that vote, demonstrations, proposals of each
     energy: Callable[[Tensor], Tensor]  # of any poses X_WF (..., 4, 4); differentiable
-    # Of a pose X_WF (4, 4): (P, Q) shares of the pairs of parts in it, the first nodes of each.
+    # From a pose X_WF (4, 4): (P, Q) shares of the pairs of parts, the first nodes of each.
     pair_weights: Callable[[Tensor], Tensor]
     seconds: dict[str, float]  # of each stage
 
@@ -166,7 +166,7 @@ class IgaAligner:
         seed: int = 0,
         logits: Callable[[Tensor], Tensor] | None = None,
     ) -> Explanation:
-        """What `align` does, with everything on the way.
+        """The estimate of `align` with its intermediate results.
 
         `logits` takes the place of the learned matches: nodes (2, D + 1, M), as in
         `Explanation.index`, to logits (2, D, M, M).

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from iga_drake.aligners.iga.local_stages import LocalCoordinates, LocalMoments, LocalParts
 from iga_drake.aligners.iga.vector_neurons import VectorLinear
 from iga_drake.errors import IgaDrakeError
 
@@ -41,95 +42,13 @@ class DescriptorConfig:
     descriptor: int = 64
     # Whether nodes attend to the object's other clouds after every layer but the last.
     cross: bool = True
-    # What first looks at the surroundings of a node: moments over the shells; or, for comparison,
+    # The first stage, which sees a node's surroundings: moments over the shells; or, to compare,
     # the local encoder, or the moments as plain coordinates (not invariant): see local_stages.py.
     local: str = "moments"
 
     def __post_init__(self) -> None:
         if self.local not in LOCALS:
             raise DescriptorError(f"local = '{self.local}', must be one of: {', '.join(LOCALS)}")
-
-
-def shell_moments(x: Tensor, p: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Moments of dense clouds x (B, P, 3) over radial shells around nodes p (B, M, 3).
-
-    Shares of the points (B, M, S, 1); mean offsets from the node (B, M, S, 3) and second moments
-    about it (B, M, S, 3, 3), in units of the shell's radius and of its square.
-    """
-    B, M, _ = p.shape
-    S = len(radii)
-    distance = torch.cdist(p, x)[:, :, None]  # (B, M, 1, P)
-    r = radii.to(x.dtype)[:, None]
-    # Compact window of each shell: (1 - ((d - r) / 0.9 r)^2)_+^2, in place (no parameters).
-    window = (distance * (1 / (0.9 * r))).sub_(1 / 0.9)
-    window = window.square_().neg_().add_(1).clamp_min_(0).square_()
-    outer = (x[..., :, None] * x[..., None, :]).flatten(2)
-    powers = torch.cat((torch.ones_like(x[..., :1]), x, outer), -1)
-    # In this order (few rows, not few columns) it is quicker.
-    moments = (powers.mT @ window.flatten(1, 2).mT).mT
-    moments = moments.reshape(B, M, S, 13) / x.shape[1]
-    mass = moments[..., :1].clamp_min(1e-5)
-    mean = moments[..., 1:4] / mass
-    second = (moments[..., 4:] / mass).reshape(B, M, S, 3, 3)
-    q = p[:, :, None]
-    offset = (mean - q) / r
-    mean_q = mean[..., :, None] * q[..., None, :]
-    second = second - mean_q - mean_q.transpose(-1, -2) + q[..., :, None] * q[..., None, :]
-    return mass, offset, second / r[..., None] ** 2
-
-
-class LocalMoments(nn.Module):
-    """Encodes the surroundings of each node by moments over radial shells of the dense cloud.
-
-    Per shell: how full it is, the mean offset (a vector) and the second moment (a symmetric
-    matrix).
-    Learned mixtures of the vectors, also after multiplication by the second moments, are
-    equivariant;
-    their inner and triple products are invariant. Costs two matrix products, no neighbour search.
-    """
-
-    radii: Tensor
-
-    def __init__(self, config: DescriptorConfig):
-        super().__init__()
-        S, c = len(config.shells), config.vectors
-        self.register_buffer("radii", torch.tensor(config.shells), persistent=False)
-        self.mix = VectorLinear(S + 1, c)
-        self.bend = VectorLinear(S * c, c)
-        self.out = VectorLinear(2 * c + S + 1, c)
-        self.embed = nn.Sequential(
-            nn.Linear(5 * S + 4 * c, config.scalars),
-            nn.GELU(),
-            nn.Linear(config.scalars, config.scalars),
-        )
-
-    def forward(self, x: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        # x (B, P, 3) dense cloud, p (B, M, 3) nodes -> scalars (B, M, d), vectors (B, M, 3, c)
-        mass, offset, second = shell_moments(x, p, self.radii)
-        q = p[:, :, None]
-        base = torch.cat((offset, -q), 2).transpose(-1, -2)  # (B, M, 3, S + 1)
-        v = self.mix(base)
-        bent = (second @ v[:, :, None]).transpose(2, 3).flatten(3)  # (B, M, 3, S c)
-        w = self.bend(bent)
-        v_out = self.out(torch.cat((v, w, base), -1))
-        half = v.shape[-1] // 2
-        cross = torch.linalg.cross(v, w, dim=-2)
-        invariants = torch.cat(
-            (
-                0.3 * mass[..., 0].log(),
-                offset.square().sum(-1),
-                -(offset * q).sum(-1),
-                second.diagonal(dim1=-2, dim2=-1).sum(-1),
-                second.square().sum((-1, -2)),
-                v.square().sum(-2),
-                (v * w).sum(-2),
-                w.square().sum(-2),
-                (cross[..., :half] * v[..., half:]).sum(-2),
-                (cross[..., half:] * w[..., :half]).sum(-2),
-            ),
-            -1,
-        )
-        return self.embed(invariants.to(next(self.embed.parameters()).dtype)), v_out
 
 
 class _OnChannels(nn.Linear):
@@ -252,14 +171,13 @@ class CrossLayer(nn.Module):
 
 
 def _local_stage(config: DescriptorConfig) -> nn.Module:
-    """Clouds (B, P, 3), nodes (B, M, 3) -> scalars (B, M, d), vectors (B, M, 3, c)."""
+    """The first stage that `config.local` names; see local_stages.py."""
+    d, c = config.scalars, config.vectors
     if config.local == "moments":
-        return LocalMoments(config)
-    from iga_drake.aligners.iga import local_stages  # which imports this module
-
+        return LocalMoments(d, c, config.shells)
     if config.local == "encoder":
-        return local_stages.LocalParts(config)
-    return local_stages.LocalCoordinates(config)
+        return LocalParts(d, c)
+    return LocalCoordinates(d, c, config.shells)
 
 
 class DescriptorNet(nn.Module):

@@ -51,7 +51,7 @@ SPREAD = 6  # of a pair, over the demonstrations
 
 @dataclass(frozen=True)
 class PairProposals:
-    """What the energy of one problem is made of: K pairs, D demonstrations, C combinations."""
+    """Inputs of one problem's energy: K pairs of parts, D demonstrations, C combinations."""
 
     R: Tensor  # (K, D, C, 3, 3) rotations of A into B's frame, both about their centroids
     place: Tensor  # (K, D, C, 3) m, where they put A's part
@@ -106,7 +106,7 @@ class PairProposals:
         return rigid(self.R, self.place - turned)
 
     def to(self, dtype: torch.dtype, device: torch.device | str = "cpu") -> "PairProposals":
-        """In another precision, on another device."""
+        """A copy in another precision, on another device."""
         return PairProposals(
             self.R.to(device, dtype),
             self.place.to(device, dtype),
@@ -117,7 +117,7 @@ class PairProposals:
         )
 
     def demonstrations(self, chosen: Sequence[int]) -> "PairProposals":
-        """Of some of the demonstrations."""
+        """The proposals of the `chosen` demonstrations alone."""
         at = list(chosen)
         return PairProposals(
             self.R[:, at],
@@ -395,7 +395,7 @@ class PairEnergyNet(nn.Module):
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """How the lowest energies are sought."""
+    """Options of the search for the lowest energies."""
 
     each: int = 4  # proposals taken of every combination of every demonstration
     starts: int = 24  # that are refined, unlike each other

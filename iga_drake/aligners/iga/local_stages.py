@@ -1,20 +1,100 @@
-"""Other first stages of the descriptor network, to compare the default one with.
+"""First stages of the descriptor network: encoders of a node's surroundings.
 
-Like `LocalMoments` they turn a cloud (B, P, 3), of unit root-mean-square radius about its centroid,
-and nodes (B, M, 3) among its points into scalars (B, M, d) and vectors (B, M, 3, c).
+Every stage turns a cloud (B, P, 3), of unit root-mean-square radius about its centroid, and nodes
+(B, M, 3) among its points into scalars (B, M, d) and vectors (B, M, 3, c). `LocalMoments` is the
+default; `LocalParts` and `LocalCoordinates` are there to compare it with.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from iga_drake.aligners.iga.descriptor import DescriptorConfig, shell_moments
 from iga_drake.aligners.iga.local_encoder import EncoderConfig, LocalEncoder, nearest_centre
 from iga_drake.aligners.iga.vector_neurons import EPSILON, VectorLinear
 
 TYPICAL_RADIUS = 0.065  # m, root-mean-square, of the clouds that the local encoder is trained on
 PARTS = 16  # as many centres of parts as the local encoder is trained on
+
+
+def shell_moments(x: Tensor, p: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Moments of dense clouds x (B, P, 3) over radial shells around nodes p (B, M, 3).
+
+    Shares of the points (B, M, S, 1); mean offsets from the node (B, M, S, 3) and second moments
+    about it (B, M, S, 3, 3), in units of the shell's radius and of its square.
+    """
+    B, M, _ = p.shape
+    S = len(radii)
+    distance = torch.cdist(p, x)[:, :, None]  # (B, M, 1, P)
+    r = radii.to(x.dtype)[:, None]
+    # Compact window of each shell: (1 - ((d - r) / 0.9 r)^2)_+^2, in place (no parameters).
+    window = (distance * (1 / (0.9 * r))).sub_(1 / 0.9)
+    window = window.square_().neg_().add_(1).clamp_min_(0).square_()
+    outer = (x[..., :, None] * x[..., None, :]).flatten(2)
+    powers = torch.cat((torch.ones_like(x[..., :1]), x, outer), -1)
+    # In this order (few rows, not few columns) it is quicker.
+    moments = (powers.mT @ window.flatten(1, 2).mT).mT
+    moments = moments.reshape(B, M, S, 13) / x.shape[1]
+    mass = moments[..., :1].clamp_min(1e-5)
+    mean = moments[..., 1:4] / mass
+    second = (moments[..., 4:] / mass).reshape(B, M, S, 3, 3)
+    q = p[:, :, None]
+    offset = (mean - q) / r
+    mean_q = mean[..., :, None] * q[..., None, :]
+    second = second - mean_q - mean_q.transpose(-1, -2) + q[..., :, None] * q[..., None, :]
+    return mass, offset, second / r[..., None] ** 2
+
+
+class LocalMoments(nn.Module):
+    """Encodes the surroundings of each node by moments over radial shells of the dense cloud.
+
+    Per shell: how full it is, the mean offset (a vector) and the second moment (a symmetric
+    matrix). Learned mixtures of the vectors, also after multiplication by the second moments, are
+    equivariant; their inner and triple products are invariant. Costs two matrix products, no
+    neighbour search.
+    """
+
+    radii: Tensor
+
+    def __init__(self, scalars: int, vectors: int, shells: Sequence[float]):
+        super().__init__()
+        S, c = len(shells), vectors
+        self.register_buffer("radii", torch.tensor(shells), persistent=False)
+        self.mix = VectorLinear(S + 1, c)
+        self.bend = VectorLinear(S * c, c)
+        self.out = VectorLinear(2 * c + S + 1, c)
+        self.embed = nn.Sequential(
+            nn.Linear(5 * S + 4 * c, scalars), nn.GELU(), nn.Linear(scalars, scalars)
+        )
+
+    def forward(self, x: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        # x (B, P, 3) dense cloud, p (B, M, 3) nodes -> scalars (B, M, d), vectors (B, M, 3, c)
+        mass, offset, second = shell_moments(x, p, self.radii)
+        q = p[:, :, None]
+        base = torch.cat((offset, -q), 2).transpose(-1, -2)  # (B, M, 3, S + 1)
+        v = self.mix(base)
+        bent = (second @ v[:, :, None]).transpose(2, 3).flatten(3)  # (B, M, 3, S c)
+        w = self.bend(bent)
+        v_out = self.out(torch.cat((v, w, base), -1))
+        half = v.shape[-1] // 2
+        cross = torch.linalg.cross(v, w, dim=-2)
+        invariants = torch.cat(
+            (
+                0.3 * mass[..., 0].log(),
+                offset.square().sum(-1),
+                -(offset * q).sum(-1),
+                second.diagonal(dim1=-2, dim2=-1).sum(-1),
+                second.square().sum((-1, -2)),
+                v.square().sum(-2),
+                (v * w).sum(-2),
+                w.square().sum(-2),
+                (cross[..., :half] * v[..., half:]).sum(-2),
+                (cross[..., half:] * w[..., :half]).sum(-2),
+            ),
+            -1,
+        )
+        return self.embed(invariants.to(next(self.embed.parameters()).dtype)), v_out
 
 
 class LocalParts(nn.Module):
@@ -24,15 +104,15 @@ class LocalParts(nn.Module):
     Invariant under rotations, as far as the choice of the first nodes is.
     """
 
-    def __init__(self, config: DescriptorConfig):
+    def __init__(self, scalars: int, vectors: int):
         super().__init__()
         light = EncoderConfig.light()
         self.encoder = LocalEncoder(dataclasses.replace(light, unit=light.unit / TYPICAL_RADIUS))
-        self.vectors = VectorLinear(light.channels + 2, config.vectors)
+        self.vectors = VectorLinear(light.channels + 2, vectors)
         self.embed = nn.Sequential(
-            nn.Linear(light.scalars + light.channels + 2, config.scalars),
+            nn.Linear(light.scalars + light.channels + 2, scalars),
             nn.GELU(),
-            nn.Linear(config.scalars, config.scalars),
+            nn.Linear(scalars, scalars),
         )
 
     def forward(self, x: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
@@ -60,12 +140,12 @@ class LocalCoordinates(nn.Module):
 
     radii: Tensor
 
-    def __init__(self, config: DescriptorConfig):
+    def __init__(self, scalars: int, vectors: int, shells: Sequence[float]):
         super().__init__()
-        d, c = config.scalars, config.vectors
-        self.register_buffer("radii", torch.tensor(config.shells), persistent=False)
+        d, c = scalars, vectors
+        self.register_buffer("radii", torch.tensor(shells), persistent=False)
         self.embed = nn.Sequential(
-            nn.Linear(10 * len(config.shells) + 3, d), nn.GELU(), nn.Linear(d, d + 3 * c)
+            nn.Linear(10 * len(shells) + 3, d), nn.GELU(), nn.Linear(d, d + 3 * c)
         )
         self.sizes = (d, 3 * c)
 

@@ -117,7 +117,7 @@ def _closeness(a: Tensor, b: Tensor, sigma: float) -> Tensor:
     half_a, half_b = (-0.5 * each.square().sum(-1, keepdim=True) for each in (a, b))
     one_a, one_b = torch.ones_like(half_a), torch.ones_like(half_b)
     b = torch.cat((b, half_b, one_b), -1) / sigma**2
-    # Of points that are one, rounding may leave a little more than 1.
+    # Rounding may leave a little more than 1 where points coincide.
     return (torch.cat((a, one_a, half_a), -1) @ b.T).exp_()
 
 
@@ -163,8 +163,11 @@ def _area(sides: Tensor) -> Tensor:
 
 
 def draw_triplets(p: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Of every object (B) `count` times three different test nodes and demonstration nodes drawn
-    from their matches p (B, M, N): indices (B, count, 3) both."""
+    """Draws `count` triplets of matched nodes for each of B objects.
+
+    p (B, M, N) are probabilities of matches of test nodes with demonstration nodes. Returns indices
+    (B, count, 3) of three different test nodes, and of the demonstration nodes drawn for them.
+    """
     B, M, N = p.shape
 
     def below(n: int) -> Tensor:
@@ -186,8 +189,11 @@ def draw_triplets(p: Tensor, count: int, generator: torch.Generator) -> tuple[Te
 def global_hypotheses(
     p: Tensor, x: Tensor, y: Tensor, config: VotingConfig, generator: torch.Generator
 ) -> list[tuple[Tensor, Tensor]]:
-    """Of every object (B) coarse motions (H, 4, 4) of unit-scaled test nodes x (B, M, 3) onto y
-    (B, N, 3), best first, and their log-likelihoods (H,); p (B, M, N) probabilities of matches.
+    """Coarse motions of test nodes onto demonstration nodes, for each of B objects.
+
+    x (B, M, 3) are unit-scaled test nodes, y (B, N, 3) demonstration nodes, p (B, M, N)
+    probabilities of their matches. Returns for every object motions (H, 4, 4), best first, and
+    their log-likelihoods (H,).
 
     Triplets of matches drawn from the soft matching, fitted (Kabsch), scored by the likelihood of
     all nodes under descriptors and geometry, refined by expectation maximisation.

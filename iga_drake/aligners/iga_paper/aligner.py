@@ -10,12 +10,12 @@ from torch import Tensor
 
 from iga_drake.aligners.iga_paper.langevin import LangevinConfig
 from iga_drake.aligners.iga_paper.model import PaperModel, kind_of, load_model
-from iga_drake.aligners.iga_paper.nodes import Problem, problem
+from iga_drake.aligners.iga_paper.nodes import PaperProblem, problem
 from iga_drake.aligners.iga_paper.search import best, search_rotation, search_translation
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate
 from iga_drake.checkpoint import file_digest, network_digest
 from iga_drake.demonstrations.alignment import Alignment, check_cloud
-from iga_drake.geometry.se3 import geodesic_angle
+from iga_drake.geometry.se3 import geodesic_angle, nearest_rotation
 from iga_drake.paths import models_dir
 
 DISTINCT_PLACE = 0.02  # m: particles nearer than this are one mode
@@ -24,7 +24,7 @@ DISTINCT_TURN = 0.35  # rad
 
 @dataclass(frozen=True)
 class IgaPaperConfig:
-    """How the aligner searches."""
+    """Options of the search."""
 
     points: int = 256  # of a cloud, as in training; drawn where there are more
     rotation: LangevinConfig = field(default_factory=LangevinConfig)
@@ -34,13 +34,17 @@ class IgaPaperConfig:
 
 
 def landed(part: str) -> Path:
-    """Where the checkpoint of a part lies that comes with the package."""
+    """Path of the checkpoint of a part that comes with the package."""
     return models_dir() / "weights" / f"{kind_of(part)}.safetensors"
 
 
 def found_path(part: str, path: Path | str | None, name: str) -> Path:
-    """A part's checkpoint for the aligner `name`: a file, the landed one, or in a folder: of
-    checkpoints, or of trainings by part, the best where one was chosen. Raises `AlignerError`."""
+    """Path of a part's checkpoint for the aligner `name`.
+
+    `path` is the file itself, a folder of checkpoints, or a folder of trainings by part (the best
+    weights where validation chose any); None means the checkpoint that comes with the package.
+    Raises `AlignerError`.
+    """
     chosen = Path(path) if path else landed(part)
     file = f"{kind_of(part)}.safetensors"
     places = [chosen / file, chosen / part / "best.safetensors", chosen / part / file]
@@ -55,7 +59,7 @@ def found_path(part: str, path: Path | str | None, name: str) -> Path:
 
 def found_model(part: str, path: Path | str | None, name: str) -> tuple[PaperModel, str]:
     """The model of `found_path` and its file's digest. Raises `AlignerError`, and `CheckpointError`
-    where it is a foreign one."""
+    for another kind of checkpoint."""
     found = found_path(part, path, name)
     return load_model(found, part)[0], file_digest(found)
 
@@ -73,7 +77,7 @@ def _drawn(cloud: np.ndarray, count: int, seed: int) -> Tensor:
 class Asked:
     """One problem (S = 1), and where its objects lie."""
 
-    problem: Problem
+    problem: PaperProblem
     centres: np.ndarray  # (2, 3) m, of the test's A and B in the frames given
 
     @staticmethod
@@ -87,7 +91,10 @@ class Asked:
         seed: int,
         name: str,
     ) -> "Asked":
-        """Of clouds in metres. Raises `AlignerError`, which begins with `name`."""
+        """The problem of demonstrations and test clouds (P, 3) m, `points` drawn of each.
+
+        Raises `AlignerError`, which begins with `name`.
+        """
         if not context:
             raise AlignerError(f"{name}: the context is empty: give at least one demonstration")
         pairs = [(a.grasped, a.target) for a in context]
@@ -112,8 +119,7 @@ class Asked:
         """X_WF (M, 4, 4) float64 in the frames given, from R (M, 3, 3), t (M, 3)."""
         X = np.tile(np.eye(4), (len(R), 1, 1))
         # Single precision leaves rotations a little off.
-        U, _, Vt = np.linalg.svd(R.double().numpy())
-        X[:, :3, :3] = U @ Vt
+        X[:, :3, :3] = nearest_rotation(R.double()).numpy()
         X[:, :3, 3] = t.double().numpy() + self.centres[1] - X[:, :3, :3] @ self.centres[0]
         return X
 

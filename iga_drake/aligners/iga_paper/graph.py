@@ -198,7 +198,7 @@ class _Projection(NamedTuple):
         return mapped.permute(3, 4, 0, 1, 2, 5).contiguous().unbind(0)
 
     def of_rotated(self, Y: Tensor, bias: Tensor) -> "_OfRotation":
-        """The same maps of features sum_r R_r Y_r + bias, Y (S, 9, K, D), as functions of R."""
+        """The maps of features sum_r R_r Y_r + bias, Y (S, 9, K, D), as functions of R."""
         H, D = self.heads, Y.shape[-1]
         coefficients = nn.functional.linear(Y, self.matrix).unflatten(-1, (-1, H, D // H))
         constant = nn.functional.linear(bias, self.matrix, self.bias)
@@ -276,7 +276,7 @@ class GraphLayer(nn.Module):
         self.to_class = nn.ModuleList(GraphConvolution(config, edge=False) for _ in (A, B))
 
     def projections(self, role: int) -> tuple[_Projection, _Projection]:
-        """Of the nodes of one object: of a demonstration (P = 9) and of the test (P = 8).
+        """Projections of the nodes of one object: a demonstration's (P = 9) and the test's (P = 8).
 
         P in order: queries, keys and values within the object; between the objects; then for a
         demonstration keys and values along demonstration edges, for the test queries; W1 F, summed.
@@ -314,7 +314,7 @@ class _Memory(NamedTuple):
 
 
 class _LayerContext(NamedTuple):
-    """What a layer but the last needs beside the candidate alignments."""
+    """The inputs of every layer but the last that don't depend on the candidate alignments."""
 
     asked: tuple[_Projection, _Projection]  # of the test nodes of A and B
     within: tuple[Tensor, Tensor]  # W6 (H, d, E)
@@ -323,7 +323,7 @@ class _LayerContext(NamedTuple):
 
 
 class Context(NamedTuple):
-    """All of S problems that the poses of the grasped objects leave alone."""
+    """Features of S problems that don't depend on the poses of the grasped objects."""
 
     positions: tuple[Tensor, Tensor]  # (S, K, 3) of the test's A and B
     edges_B: Tensor  # (S, 1, K, K, E)
@@ -372,7 +372,7 @@ class GraphNetwork(nn.Module):
                 module.power_iteration(count)
 
     def context(self, demonstrations: tuple[Nodes, Nodes], test: tuple[Nodes, Nodes]) -> Context:
-        """What is computed once per problem.
+        """Features of problems that are computed once, for all candidate poses.
 
         Args:
           demonstrations: nodes of A and B, (S, N, K), both in one frame for each alignment.
@@ -415,7 +415,7 @@ class GraphNetwork(nn.Module):
     def _first_layer(
         self, layers: list[_LayerContext], test: tuple[Nodes, Nodes], L: int
     ) -> Context:
-        """Of the test nodes, as far as no pose is needed."""
+        """The context with the first layer's features of the test nodes that need no pose."""
         first = layers[0]
         # F = W R V + b = sum_(x y) R_xy W_x V_y + b, for the axes x, y of the vectors V.
         W = self.embed.matrix().unflatten(1, (3, -1))  # (D, 3, C)

@@ -23,7 +23,7 @@ class SamplerError(IgaDrakeError):
 
 @dataclass(frozen=True)
 class LangevinConfig:
-    """Of one network's sampling.
+    """Options of the sampling by one network.
 
     A step is minus `rate` / 2 times the gradient, plus noise of variance `rate`; both shrink.
     """

@@ -11,14 +11,14 @@ from iga_drake.aligners.iga_paper.graph import GraphConfig, GraphNetwork, Nodes
 from iga_drake.aligners.iga_paper.nodes import encode
 from iga_drake.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 
-# What is trained, and how many numbers the network puts out: energies of rotations or of
-# translations; the transform itself (DirReg); its distance to the right one (DFM).
+# The parts that are trained, and how many numbers each network puts out: energies of rotations
+# or of translations; the transform itself (DirReg); its distance to the right one (DFM).
 OUTPUTS = {"rotation": 1, "translation": 1, "dirreg": 9, "dfm": 2}
 SETTLED = 40  # power iterations of weights that stay as they are
 
 
 def kind_of(part: str) -> str:
-    """Of the checkpoints of a part, and the stem of their files' names."""
+    """The kind of a part's checkpoints, which is also the stem of their files' names."""
     return f"paper-{part}"
 
 

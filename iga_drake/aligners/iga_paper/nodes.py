@@ -9,7 +9,7 @@ from iga_drake.aligners.iga.local_encoder import LocalEncoder
 from iga_drake.aligners.iga_paper.graph import A, B, Context, GraphNetwork, Nodes
 
 
-class Problem(NamedTuple):
+class PaperProblem(NamedTuple):
     """Nodes of S problems, both objects of the test about their own centres."""
 
     demonstrations: tuple[Nodes, Nodes]  # of A and B, (S, N, K), in their common frames
@@ -17,7 +17,7 @@ class Problem(NamedTuple):
     centres: tuple[Tensor, Tensor]  # (S, 3) m of the test's A and B: the means of their nodes
 
     def context(self, network: GraphNetwork) -> Context:
-        """What a network computes once."""
+        """The network's features of the problems, independent of the candidate poses."""
         return network.context(self.demonstrations, self.test)
 
     def offset(self) -> Tensor:
@@ -34,8 +34,8 @@ def encode(encoder: LocalEncoder, clouds: Tensor, count: int) -> Nodes:
     return Nodes(found.centres.unflatten(0, lead), found.vectors.unflatten(0, lead))
 
 
-def problem(alignments: Nodes) -> Problem:
-    """From the nodes (S, 2, N + 1, K) of A and B in N + 1 alignments, the last one the test's."""
+def problem(alignments: Nodes) -> PaperProblem:
+    """Problems from the nodes (S, 2, N + 1, K) of A and B in N + 1 alignments, the test's last."""
     shown = [Nodes(*(part[:, role, :-1] for part in alignments)) for role in (A, B)]
     asked = [Nodes(*(part[:, role, -1] for part in alignments)) for role in (A, B)]
     centres = [nodes.positions.mean(1) for nodes in asked]
@@ -43,4 +43,4 @@ def problem(alignments: Nodes) -> Problem:
         Nodes(nodes.positions - centre[:, None], nodes.vectors)
         for nodes, centre in zip(asked, centres, strict=True)
     ]
-    return Problem((shown[A], shown[B]), (test[A], test[B]), (centres[A], centres[B]))
+    return PaperProblem((shown[A], shown[B]), (test[A], test[B]), (centres[A], centres[B]))

@@ -1,7 +1,7 @@
 """From trained networks to poses: the paper's sampler and those of its two variants.
 
-All work on S problems at once, in the frame of `Problem`: a pose R (3, 3), t (3,) turns A's nodes
-about their centre and puts that centre at t from B's.
+All work on S problems at once, in the frame of `PaperProblem`: a pose R (3, 3), t (3,) turns A's
+nodes about their centre and puts that centre at t from B's.
 """
 
 from dataclasses import replace

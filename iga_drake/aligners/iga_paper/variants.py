@@ -18,7 +18,7 @@ from iga_drake.demonstrations.alignment import Alignment
 
 @dataclass(frozen=True)
 class DirRegConfig:
-    """How often the transform is regressed, each time from where the last one led."""
+    """Options of the regression; every iteration starts where the last one ended."""
 
     points: int = 256  # of a cloud
     iterations: int = 1
@@ -69,14 +69,16 @@ class DirRegAligner:
 
 
 def descent() -> LangevinConfig:
-    """Of distances, whose slopes are 1 per rad and 10 per metre: up to 0.1 rad and 1 cm a step,
-    without noise."""
+    """Options of the descent of a distance, without noise.
+
+    Distances have slopes of 1 per rad and 10 per metre, so a step is up to 0.1 rad and 1 cm.
+    """
     return LangevinConfig(rotation_rate=0.2, translation_rate=2e-3, noise=0.0)
 
 
 @dataclass(frozen=True)
 class DfmConfig:
-    """How distances are descended."""
+    """Options of the search of the least distance."""
 
     points: int = 256  # of a cloud
     langevin: LangevinConfig = field(default_factory=descent)

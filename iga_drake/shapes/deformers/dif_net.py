@@ -22,10 +22,10 @@ from iga_drake.shapes.dif_net import (
     siren,
     siren_jacobian,
 )
-from iga_drake.shapes.instance import ShapeError
+from iga_drake.shapes.errors import ShapeError
 
 
-def default_weights() -> Path:
+def default_dif_net_weights() -> Path:
     """The weights that come with the package."""
     return models_dir() / "weights" / "dif_net.safetensors"
 
@@ -64,7 +64,7 @@ class DifNetDeformer:
         two trained latents instead of normal; stretch: sigma of log axis scales, drawn besides;
         checked_points: at how many vertices folding is looked for (0: nowhere); double: in double
         precision, of the package's weights."""
-        self.net = (_landed(default_weights(), double) if net is None else net).eval()
+        self.net = (_landed(default_dif_net_weights(), double) if net is None else net).eval()
         if len(self.net.latents) < 2:
             raise ShapeError(
                 f"DifNetDeformer: {len(self.net.latents)} trained latents, at least 2 are needed"

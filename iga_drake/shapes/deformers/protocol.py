@@ -1,4 +1,4 @@
-"""What a deformer is, and the shapes that it takes."""
+"""The protocol of deformers, and the shapes that they take."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,9 +11,9 @@ from iga_drake.shapes.instance import ShapeInstance
 
 @dataclass(frozen=True, eq=False)
 class DeformableShape:
-    """A mesh in its own frame (m, z up), with what is known about its parts and its making.
+    """A mesh in its own frame (m, z up), with its part labels and parameters where they are known.
 
-    Two are equal where they are the same object; don't change the arrays of one.
+    Compares by identity; the arrays must not be changed.
     """
 
     vertices: np.ndarray  # (V, 3) m
@@ -24,7 +24,7 @@ class DeformableShape:
 
     @staticmethod
     def of(instance: ShapeInstance) -> "DeformableShape":
-        """An instance of a parametric family."""
+        """The mesh, labels and parameters of an instance of a parametric family."""
         return DeformableShape(
             vertices=instance.vertices,
             faces=instance.faces,

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from iga_drake.shapes.deformers.protocol import DeformableShape
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.family import Family
-from iga_drake.shapes.instance import ShapeError
 
 
 class ReinstancingDeformer:

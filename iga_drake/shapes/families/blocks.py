@@ -9,8 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.family import Draft
-from iga_drake.shapes.instance import ShapeError
 from iga_drake.shapes.surfaces import (
     Surface,
     loft,
@@ -330,7 +330,7 @@ def _outline_section(segments: int, exponent: float) -> tuple[np.ndarray, np.nda
     return _read_only(section), _read_only(t), stations(33)
 
 
-def outline(
+def closed_outline(
     length: float, widths: Sequence[float], segments: int, exponent: float = 2.3
 ) -> tuple[np.ndarray, np.ndarray]:
     """(S, 2) a closed outline along x, as wide as spline controls `widths` (m) say from -x to +x.

@@ -6,8 +6,10 @@ from itertools import pairwise
 import numpy as np
 
 from iga_drake.shapes import surfaces
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.family import Draft, Family, Parameters, Part
-from iga_drake.shapes.instance import ShapeError, ShapeInstance, frame
+from iga_drake.shapes.instance import ShapeInstance, frame
+from iga_drake.shapes.symmetry import Symmetry
 
 FAMILY = "bowl"
 PART_NAMES = ("underside", "wall_outside", "rim", "wall_inside", "floor")
@@ -96,7 +98,12 @@ def draft(parameters: Parameters) -> Draft:
     return Draft((Part("bowl", surface, lambda: _pieces(shell), (PART_NAMES, bands)),), frames)
 
 
-_FAMILY = Family(FAMILY, {key: RANGES[key] for key in RANGES if key != "mass"}, draft)
+_FAMILY = Family(
+    FAMILY,
+    {key: RANGES[key] for key in RANGES if key != "mass"},
+    draft,
+    symmetry=Symmetry(order=0),
+)
 
 
 def build(parameters: dict[str, float]) -> ShapeInstance:

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from iga_drake.shapes import surfaces
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.family import Draft, Family, Parameters, Part
-from iga_drake.shapes.instance import ShapeError, ShapeInstance, frame
+from iga_drake.shapes.instance import ShapeInstance, frame
 
 FAMILY = "pan"
 PART_NAMES = ("underside", "wall_outside", "rim", "wall_inside", "floor", "handle")

@@ -1,4 +1,4 @@
-"""What things hang on or stand in: hook stand, dish rack and coat hanger. They stand on z = 0.
+"""Stands that hold other objects: hook stand, dish rack and coat hanger. They stand on z = 0.
 
 Frames: `base` on the ground; `hook_upper`, `hook_lower`, `hook` and `peg` at the tip of a hook or
 peg, x along it outwards; `opening` in the mouth of a rack's holder, z out of it; `bar` in the

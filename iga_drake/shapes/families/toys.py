@@ -12,8 +12,8 @@ from itertools import pairwise
 import numpy as np
 
 from iga_drake.shapes.families.blocks import (
+    closed_outline,
     hulls,
-    outline,
     rings,
     spline,
     stand,
@@ -205,7 +205,7 @@ def _guitar(p: Parameters) -> Draft:
     # The neck up along z, the front towards +x, the body across y.
     tall, wide, deep = p["body_length"], p["body_width"], p["depth"]
     widths = wide * np.array([0.5, 1.0, 1.1, p["waist"], p["upper"], p["upper"], 0.3])
-    plan, t = outline(tall, widths.tolist(), _GUITAR_ROUND)
+    plan, t = closed_outline(tall, widths.tolist(), _GUITAR_ROUND)
     # A cutaway beside the neck, on the side at +y.
     cut = np.where(plan[:, 1] > 0, np.exp(-(((t - 0.92) / 0.09) ** 2)), 0.0)
     plan = plan * np.column_stack([np.ones_like(t), 1 - p["cutaway"] * cut])

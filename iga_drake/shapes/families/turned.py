@@ -16,13 +16,13 @@ VESSEL_BANDS = ("underside", "wall_outside", "rim", "wall_inside", "floor")
 
 
 class Anchor(NamedTuple):
-    """Where something is fixed to a wall, in the half plane (r, z)."""
+    """A point and normal at which a part is fixed to a wall, in the half plane (r, z)."""
 
     point: np.ndarray  # (2,) m, some way below the outer surface
     normal: np.ndarray  # (2,) outwards
 
     def opposite(self) -> "Anchor":
-        """The same at the other side (azimuth pi), in the plane (x, z)."""
+        """The anchor at the wall's other side (azimuth pi), in the plane (x, z)."""
         flip = np.array([-1.0, 1.0])
         return Anchor(self.point * flip, self.normal * flip)
 

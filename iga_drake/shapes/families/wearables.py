@@ -1,4 +1,4 @@
-"""What one wears: shoe, boot, cap and hat. They stand on z = 0, the front towards +x.
+"""Wearables: shoe, boot, cap and hat. They stand on z = 0, the front towards +x.
 
 Frames: `sole` under the middle of a sole, z up; `opening` in the middle of a shoe's or boot's
 opening, z out of it; `toe` and `heel` at the ends of a sole, x outwards; `head_opening` in the
@@ -13,9 +13,9 @@ import numpy as np
 
 from iga_drake.shapes.families.blocks import (
     SHELL_BANDS,
+    closed_outline,
     dome,
     hulls,
-    outline,
     rings,
     sheet,
     sheet_pieces,
@@ -40,7 +40,7 @@ def _footwear(p: Parameters) -> Draft:
     long, wide, wall = p["length"], p["width"], p["wall"]
     heel, waist, ball, toe = p["heel_width"], p["waist_width"], 1.0, p["toe_width"]
     widths = wide * np.array([heel, heel, waist, ball, ball, toe])
-    plan, t = outline(long, widths.tolist(), _ROUND)
+    plan, t = closed_outline(long, widths.tolist(), _ROUND)
     bend = p["bend"] * wide * (t - 0.4) ** 2  # a left shoe's inside is the other's outside
     plan = plan + np.column_stack([0 * t, bend])
     direction = superellipse(_ROUND, 2.0)

@@ -85,8 +85,6 @@ class RgbdCamera:
     far: float = 3.0
     noise: DepthNoise = field(default_factory=DepthNoise)
     calibration: CalibrationError = field(default_factory=CalibrationError)
-    noise: DepthNoise = field(default_factory=DepthNoise)
-    calibration: CalibrationError = field(default_factory=CalibrationError)
 
     def check(self, where: str) -> None:
         """Raises `ConfigError` for a value out of range."""

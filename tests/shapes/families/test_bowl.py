@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from family_checks import check_inertia, check_mesh_and_parts, inside_pieces, solid_points
+from family_properties import turned_distance
 
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.families import bowl
-from iga_drake.shapes.instance import ShapeError, ShapeInstance
+from iga_drake.shapes.instance import ShapeInstance
 
 REFERENCE = bowl.build(bowl.sample_parameters(np.random.default_rng(1000)))
 
@@ -44,6 +46,12 @@ def test_pieces_leave_the_cavity_free(instance: ShapeInstance) -> None:
     angle = rng.uniform(0, 2 * np.pi, len(z))
     points = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
     assert inside_pieces(instance, points, 0.0).mean() < 0.015
+
+
+def test_any_turn_about_z_carries_the_bowl_onto_itself(instance: ShapeInstance) -> None:
+    assert (instance.symmetry.axis, instance.symmetry.order) == ("z", 0)
+    for R in instance.symmetry.rotations(steps=5)[1:]:
+        assert turned_distance(instance, R, np.zeros(3)) < 0.005
 
 
 def test_the_rim_frame_stands_on_the_rim_across_the_wall(instance: ShapeInstance) -> None:

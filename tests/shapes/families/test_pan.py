@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from family_checks import check_inertia, check_mesh_and_parts, inside_pieces, solid_points
 
+from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.families import pan
-from iga_drake.shapes.instance import ShapeError, ShapeInstance
+from iga_drake.shapes.instance import ShapeInstance
 
 REFERENCE = pan.build(pan.sample_parameters(np.random.default_rng(1000)))
 
