@@ -13,6 +13,8 @@ import torch
 from scipy.ndimage import minimum_filter
 from torch import Tensor
 
+from iga_drake.errors import check_range
+
 LOST = 0.0  # depth of a pixel without a measurement, as RealSense cameras and Drake report it
 _PATCHES = 32  # of correlated noise along an image's side, a power of two; they repeat
 # Depth edges in images: what lies within so many m of a step down by so many m. Chosen to lose as
@@ -47,6 +49,18 @@ class DepthNoise:
     # Share of them that fly behind the edge, in [0, 1 - edge_lost], by up to `flying` (m), >= 0.
     edge_flying: float = 0.1
     flying: float = 0.02
+
+    def check(self, where: str = "noise") -> None:
+        """Raises `ConfigError` for a value out of range."""
+        for name in ("focal_baseline", "patch", "quantum"):
+            check_range(getattr(self, name) > 0, f"{where}.{name}", getattr(self, name), "> 0")
+        for name in ("disparity", "patch_disparity", "flying"):
+            check_range(getattr(self, name) >= 0, f"{where}.{name}", getattr(self, name), ">= 0")
+        kept, lost = self.grazing_kept, self.grazing_lost
+        check_range(0 <= lost <= kept <= 1, f"{where}.grazing_lost", lost, f"0..{kept}")
+        lost, flying = self.edge_lost, self.edge_flying
+        check_range(0 <= lost <= 1, f"{where}.edge_lost", lost, "0..1")
+        check_range(0 <= flying <= 1 - lost, f"{where}.edge_flying", flying, "0..1 - edge_lost")
 
 
 def noisy_samples(

@@ -96,7 +96,7 @@ def test_what_is_stated_is_taken_and_the_rest_stays(tmp_path):
         control: {period: 1e-2, linear_speed: 1}
         task: {name: stack}
         aligner: {options: {count: 3, color: red}}
-        cameras: {left: {noise: {gaussian: false}}}
+        cameras: {left: {noise: {disparity: 0.1}}, right: {noisy: false}}
         """,
     )
     assert scenario.plant.time_step == 0.001
@@ -104,9 +104,10 @@ def test_what_is_stated_is_taken_and_the_rest_stays(tmp_path):
     assert scenario.control.period == 0.01
     assert scenario.control.linear_speed == 1.0
     assert scenario.aligner.options == {"count": 3.0, "color": "red"}
-    assert scenario.camera_names == ("left",)
-    assert not scenario.cameras["left"].noise.gaussian
-    assert scenario.cameras["left"].noise.dropouts
+    assert scenario.camera_names == ("left", "right")
+    assert scenario.cameras["left"].noise.disparity == 0.1
+    assert scenario.cameras["left"].noise.quantum == RgbdCamera().noise.quantum
+    assert not scenario.cameras["right"].noisy
     assert scenario.cameras["left"].intrinsics == RgbdCamera().intrinsics
 
 
@@ -163,7 +164,8 @@ def test_wrong_type_names_the_key(tmp_path, text, where):
         ("cameras: {a: {pose: {position: [1, 2]}}}", "cameras.a.pose.position"),
         ("cameras: {a: {pose: {position: [1, 2, 3], target: [1, 2, 0]}}}", "cameras.a.pose.target"),
         ("cameras: {a: {near: 4}}", "near < far"),
-        ("cameras: {a: {noise: {dropout_probability: 2}}}", "dropout_probability"),
+        ("cameras: {a: {noise: {edge_lost: 2}}}", "cameras.a.noise.edge_lost"),
+        ("cameras: {a: {frame_period: 0}}", "cameras.a.frame_period"),
         ("cameras: {a: {calibration: {minimum: 0.1}}}", "calibration.minimum"),
         ("cameras: {a: {calibration: {rotation: 1}}}", "calibration.rotation"),
         ("fusion: {crop_lower: [9, 9, 9]}", "fusion.crop_lower"),

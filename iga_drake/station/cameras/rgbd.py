@@ -21,13 +21,9 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort
 from pydrake.systems.primitives import ConstantValueSource
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
+from iga_drake.dataset.depth_noise import DepthNoise
 from iga_drake.errors import check_range
-from iga_drake.station.cameras.noise import (
-    CalibrationError,
-    CameraNoise,
-    DepthNoise,
-    calibration_error,
-)
+from iga_drake.station.cameras.noise import CalibrationError, CameraNoise, calibration_error
 
 _RENDERER = "vtk"
 _CLIPPING = (0.01, 10.0)  # m, of the renderer
@@ -83,6 +79,10 @@ class RgbdCamera:
     # resolution and 0.3 m at this one.
     near: float = 0.3
     far: float = 3.0
+    # Time between two images (s): the noise of one stays the same for so long.
+    frame_period: float = 1.0 / 30.0
+    # Whether the depth has errors, and which: the same as in the training data.
+    noisy: bool = True
     noise: DepthNoise = field(default_factory=DepthNoise)
     calibration: CalibrationError = field(default_factory=CalibrationError)
 
@@ -112,6 +112,8 @@ class RgbdCamera:
             near,
             f"{_CLIPPING[0]} <= near < far <= {_CLIPPING[1]} m, what the renderer can do",
         )
+        period = self.frame_period
+        check_range(period > 0, f"{where}.frame_period", period, "> 0")
         self.noise.check(f"{where}.noise")
         self.calibration.check(f"{where}.calibration")
 
@@ -134,21 +136,26 @@ class RgbdCamera:
             ),
         )
         builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
-        noise = builder.AddNamedSystem(
-            f"{name}.noise",
-            CameraNoise(
-                self.noise,
-                width=self.intrinsics.width,
-                height=self.intrinsics.height,
-                seed=(*seed, 0),
-            ),
-        )
-        builder.Connect(sensor.depth_image_32F_output_port(), noise.get_input_port())
+        depth = sensor.depth_image_32F_output_port()
+        if self.noisy:
+            noise = builder.AddNamedSystem(
+                f"{name}.noise",
+                CameraNoise(
+                    self.noise,
+                    width=self.intrinsics.width,
+                    height=self.intrinsics.height,
+                    focal=self.intrinsics.fx,
+                    frame_period=self.frame_period,
+                    seed=(*seed, 0),
+                ),
+            )
+            builder.Connect(depth, noise.get_input_port())
+            depth = noise.get_output_port()
         X_WV = calibration_error(self.calibration, seed=(*seed, 1))
         pose = builder.AddNamedSystem(f"{name}.calibrated", ConstantValueSource(Value(X_WV @ X_WC)))
         return {
             "color_image": sensor.color_image_output_port(),
-            "depth_image": noise.get_output_port(),
+            "depth_image": depth,
             "label_image": sensor.label_image_output_port(),
             "pose": pose.get_output_port(),
             "time": sensor.image_time_output_port(),

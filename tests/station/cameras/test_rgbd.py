@@ -91,7 +91,7 @@ def test_a_rendered_image_back_projects_to_where_things_are():
     """A ball's visible cap, seen straight on, is centred on the line of sight; Drake's own
     back-projection says where its points lie."""
     camera = RgbdCamera(pose=Pose(translation=[0.0, 0.0, 0.0], rpy=[0.0, 0.0, 0.0]))
-    camera.noise.enabled = False
+    camera.noisy = False
     builder = DiagramBuilder()
     scene_graph = builder.AddSystem(SceneGraph())
     add_renderer(scene_graph)

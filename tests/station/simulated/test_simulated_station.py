@@ -64,10 +64,7 @@ def _quiet() -> Scenario:
     """The default scenario with perfect cameras."""
     scenario = _default()
     for camera in scenario.cameras.values():
-        noise = dataclasses.replace(
-            camera.noise, gaussian=False, dropouts=False, quantisation=False
-        )
-        camera.noise = noise
+        camera.noisy = False
         camera.calibration = dataclasses.replace(camera.calibration, enabled=False)
     return scenario
 
