@@ -357,10 +357,13 @@ class Episode:
         began = wall.perf_counter()
         end = self.time + duration
         while self.time < end - 1e-9:
-            due = self._snapshots[-1].time + SNAPSHOT_PERIOD
-            self.simulator.AdvanceTo(min(due, end))
-            if self.time >= due - 1e-9:
+            # On a grid without rounding errors: the same times however it is stepped.
+            due = SNAPSHOT_PERIOD * len(self._snapshots)
+            if due <= end + 1e-9:
+                self.simulator.AdvanceTo(due)
                 self._snapshots.append(self.snapshot())
+            else:
+                self.simulator.AdvanceTo(end)
             if len(self.memory.estimates) > len(self._experts):
                 now = self.snapshot()
                 for pose in self._expert(now)[len(self._experts) : len(self.memory.estimates)]:
