@@ -6,7 +6,7 @@ from iga_drake.cli.parts import Part, add_parts, run_part
 
 PARTS = {
     name: Part(f"iga_drake.studies.benchmark_{name.replace('-', '_')}")
-    for name in ("data", "fusion", "inference", "ik", "paper-energy")
+    for name in ("control", "data", "fusion", "inference", "ik", "paper-energy")
 }
 
 
