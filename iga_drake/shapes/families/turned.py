@@ -48,7 +48,7 @@ class Vessel:
 
     @property
     def rings(self) -> np.ndarray:
-        """Rings (R, S, 3) m from the underside over the rim to the floor; a view of the vertices."""
+        """Rings (R, S, 3) m, from the underside over the rim to the floor: views of vertices."""
         return self.surface.vertices[1:-1].reshape(-1, self.segments, 3)
 
     @property

@@ -16,7 +16,7 @@ from iga_drake.shapes.symmetry import Symmetry
 
 
 def _handle_frame(path: np.ndarray) -> np.ndarray:
-    """Frame X_OF in the middle of a handle's path (N, 3) in the plane y = 0, x away from its ends."""
+    """X_OF in the middle of a handle's path (N, 3) in the plane y = 0, x away from its ends."""
     middle = len(path) // 2
     along = path[middle + 1] - path[middle - 1]
     outward = np.array([-along[2], 0.0, along[0]])
