@@ -9,15 +9,11 @@ from pathlib import Path
 
 import torch
 
-from iga_drake.cli import train_paper
-from iga_drake.training import dif_net, encoder
+from iga_drake.cli import train_dif_net, train_encoder, train_paper
 from iga_drake.training.descriptor import DescriptorSettings, train_descriptor
 from iga_drake.training.energy import EnergySettings, train_energy
 from iga_drake.training.options import add_run_options, run_options, with_options
-from iga_drake.training.ranks import launched, process_group
-from iga_drake.training.settings import TrainingError
-
-ALONE = {"dif-net": dif_net, "encoder": encoder}  # train in one process
+from iga_drake.training.ranks import process_group
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,9 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     networks = parser.add_subparsers(dest="network", required=True, help="what to train")
     _add_descriptor(networks.add_parser("descriptor", help="dense descriptors of the iga aligner"))
     _add_energy(networks.add_parser("energy", help="energy of the iga aligner: ranks poses"))
-    encoder.add_arguments(networks.add_parser("encoder", help="local encoder, by occupancy"))
+    train_encoder.add_arguments(networks.add_parser("encoder", help="local encoder, by occupancy"))
     train_paper.add_arguments(networks.add_parser("paper", help="the paper's networks"))
-    dif_net.add_arguments(networks.add_parser("dif-net", help="deformed implicit field of chairs"))
+    train_dif_net.add_arguments(networks.add_parser("dif-net", help="deformed implicit field"))
 
 
 def _add_descriptor(parser: argparse.ArgumentParser) -> None:
@@ -74,14 +70,12 @@ def _train_energy(arguments: argparse.Namespace) -> int:
 
 def run(arguments: argparse.Namespace) -> int:
     """Runs the training; a run that was stopped (or killed) goes on from its last checkpoint."""
-    if arguments.network in ALONE:
-        if launched() > 1:
-            raise TrainingError(
-                f"train {arguments.network}: trains in one process: start it without torchrun"
-            )
-        return ALONE[arguments.network].main(arguments)
     torch.set_num_threads(arguments.threads)
+    if arguments.network == "encoder":
+        return train_encoder.run(arguments)
     torch.set_flush_denormal(True)
+    if arguments.network == "dif-net":
+        return train_dif_net.run(arguments)
     if arguments.network == "paper":
         return train_paper.run(arguments)
     if arguments.network == "energy":

@@ -455,7 +455,7 @@ def _look(
 
 
 def _pose(R: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """(..., 4, 4)"""
+    """The homogeneous matrix (..., 4, 4) of a pose."""
     X = np.zeros((*R.shape[:-2], 4, 4))
     X[..., :3, :3], X[..., :3, 3], X[..., 3, 3] = R, p, 1.0
     return X

@@ -99,8 +99,11 @@ def transform(X: Tensor, points: Tensor) -> Tensor:
 
 
 class _NearestRotation(torch.autograd.Function):
-    """Its derivative is that of the polar factor, bounded where singular values coincide: the
-    SVD's own is not."""
+    """The rotation nearest to a matrix.
+
+    Its derivative is that of the polar factor, bounded where singular values coincide; the
+    derivative of the SVD itself is not.
+    """
 
     @staticmethod
     def forward(ctx: Any, matrix: Tensor) -> Tensor:

@@ -396,11 +396,10 @@ class Ablations:
         return train_descriptor(
             folder,
             model=setup.descriptor,
-            config=config,
+            config=dataclasses.replace(config, scored_samples=self.count),
             samples=setup.samples,
             device=self.device,
             initial=initial,
-            validation_count=self.count,
             workers=self.workers,
         )
 

@@ -40,6 +40,7 @@ class DescriptorTraining(RunConfig):
     nodes: int = 64
     target_sigma: float = 0.05  # of the canonical size
     visible_within: float = 0.12  # a node counts where a true match is this near
+    scored_samples: int = 64  # of the validation set, that the finished weights are scored on
 
 
 @dataclass(frozen=True)
@@ -169,7 +170,6 @@ def train_descriptor(
     device: str = "cpu",
     resume: bool = True,
     initial: Path | None = None,
-    validation_count: int = 64,
     workers: int = 0,
     options: RunOptions | None = None,
 ) -> dict:
@@ -177,7 +177,7 @@ def train_descriptor(
 
     Writes the files of `TrainingRun` to `output`. A resumed run keeps the settings of its state,
     those that are given aside. Returns the model card, which ends with the statistics of the EMA
-    weights over `validation_count` samples of the validation split. Raises `IgaDrakeError`.
+    weights over `config.scored_samples` samples of the validation set. Raises `IgaDrakeError`.
     """
     saved = SavedState.read(output, KIND) if resume else None
     if saved is not None:
@@ -243,7 +243,8 @@ def train_descriptor(
     if run.ranks.first:
         final = copy.deepcopy(net)
         final.load_state_dict(run.ema)
-        scores = validate(final, config, samples, split="validation", count=validation_count)
+        count = config.scored_samples
+        scores = validate(final, config, samples, split="validation", count=count)
         card = run.save(validation=scores)
     run.close()
     return card

@@ -3,7 +3,6 @@
 The losses are those of Deng, Yang & Tong (CVPR 2021), equations in `dif_net_loss`.
 """
 
-import argparse
 import dataclasses
 import hashlib
 from dataclasses import dataclass
@@ -24,22 +23,8 @@ from iga_drake.shapes.dif_net import (
 )
 from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.families import FAMILIES
-from iga_drake.training.options import add_run_options, run_options, with_options
-from iga_drake.training.ranks import process_group
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
 from iga_drake.training.settings import TrainingError, replaced
-
-# Options of the command that replace fields of the training's settings.
-OPTIONS: dict[str, tuple[type, str]] = {
-    "family": (str, "of the training shapes"),
-    "shapes": (int, "of the training set"),
-    "steps": (int, "of the whole training"),
-    "batch": (int, "shapes of a forward pass of one process"),
-    "accumulate": (int, "forward passes of one process in a step"),
-    "points": (int, "points of each shape in a forward pass"),
-    "learning_rate": (float, "at its highest"),
-    "seed": (int, "of the first weights, the shapes and the draws of them"),
-}
 
 
 @dataclass(frozen=True)
@@ -336,32 +321,3 @@ def train_dif_net(
     card = run.save()
     run.close()
     return card
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `iga train dif-net`."""
-    add_run_options(parser, OPTIONS, workers=False)
-    parser.add_argument("--initial", type=Path, help="start from these weights of as many shapes")
-
-
-def main(arguments: argparse.Namespace) -> int:
-    """Runs the training; a run that was stopped (or killed) goes on from its last checkpoint."""
-    torch.set_num_threads(arguments.threads)
-    torch.set_flush_denormal(True)
-    settings: DifNetSettings = with_options(
-        DifNetSettings.of(arguments.out), arguments, fields=OPTIONS
-    )
-    with process_group(arguments.device) as device:
-        card = train_dif_net(
-            arguments.out,
-            model=settings.model,
-            config=settings.training,
-            device=device,
-            initial=arguments.initial,
-            options=run_options(arguments),
-        )
-    print(
-        f"step {card['step']}, {card['samples_seen']} shapes seen, {card['seconds']:.0f} s: "
-        f"{arguments.out / f'{KIND}.safetensors'}"
-    )
-    return 0

@@ -5,7 +5,6 @@ embedding of the centre nearest to it; the number of centres and where furthest 
 begins change from step to step; a batch serves for a few steps, each with its share of the queries.
 """
 
-import argparse
 import copy
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -26,8 +25,6 @@ from iga_drake.dataset.loader import Batch, sample_loader
 from iga_drake.dataset.occupancy import OccupancyConfig, make_occupancy_sample
 from iga_drake.geometry.clouds import furthest_point_sampling
 from iga_drake.precision import mixed_precision
-from iga_drake.training.options import add_run_options, run_options, with_options
-from iga_drake.training.ranks import process_group
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
 from iga_drake.training.settings import TrainingError, replaced
 
@@ -306,50 +303,3 @@ def train_encoder(
             card = run.save(validation=scores(run.ema))
     run.close()
     return card
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `iga train encoder`."""
-    add_run_options(parser)
-    parser.add_argument("--float32", action="store_true", help="no bfloat16 autocast")
-    parser.add_argument(
-        "--size", choices=("paper", "light"),
-        help="1.7 M parameters as in the paper (default of a new run), or 0.4 M",
-    )  # fmt: skip
-    parser.add_argument(
-        "--query", choices=("position", "projections"),
-        help="what the decoder sees of a query: its position, as in the paper (default of a new "
-        "run), or invariants",
-    )  # fmt: skip
-
-
-def main(arguments: argparse.Namespace) -> int:
-    """Runs the training; a run that was stopped (or killed) goes on from its last checkpoint."""
-    torch.set_num_threads(arguments.threads)
-    settings: EncoderSettings = with_options(EncoderSettings.of(arguments.out), arguments)
-    encoder, decoder = settings.encoder, settings.decoder
-    if arguments.size:
-        light = arguments.size == "light"
-        encoder = EncoderConfig.light() if light else EncoderConfig()
-        decoder = dataclasses.replace(decoder, width=128 if light else 256)
-    if arguments.query:
-        decoder = dataclasses.replace(decoder, query=arguments.query)
-    with process_group(arguments.device) as device:
-        card = train_encoder(
-            arguments.out,
-            encoder=encoder,
-            decoder=decoder,
-            config=settings.training,
-            samples=settings.samples,
-            device=device,
-            workers=arguments.workers,
-            options=run_options(arguments),
-        )
-    if "validation" in card:
-        scores = card["validation"]
-        print(
-            f"step {card['step']}, {card['samples_seen']} clouds seen, {card['seconds']:.0f} s; "
-            f"validation: accuracy {scores['accuracy']:.3f}, IoU {scores['iou']:.3f}, of the "
-            f"volume {scores['iou_uniform']:.3f}"
-        )
-    return 0

@@ -6,6 +6,7 @@ import numpy as np
 import trimesh
 from pydrake.geometry import Mesh
 from pydrake.multibody.tree import CalcSpatialInertia
+from scipy.spatial import ConvexHull
 
 from iga_drake.shapes.instance import ShapeInstance
 
@@ -25,9 +26,10 @@ def inside_pieces(instance: ShapeInstance, points: np.ndarray, tolerance: float)
     """(P,) whether each point is inside a convex piece grown by `tolerance` (m)."""
     inside = np.zeros(len(points), dtype=bool)
     for piece in instance.convex_pieces:
-        hull = trimesh.convex.convex_hull(piece)
-        offset = np.einsum("fd,fd->f", hull.triangles[:, 0], hull.face_normals)
-        inside |= (points @ hull.face_normals.T - offset <= tolerance).all(axis=1)
+        low, high = piece.min(axis=0) - tolerance, piece.max(axis=0) + tolerance
+        near = np.flatnonzero(~inside & ((points >= low) & (points <= high)).all(axis=1))
+        planes = ConvexHull(piece).equations  # (F, 4) unit normals outwards, offsets
+        inside[near] = (points[near] @ planes[:, :3].T + planes[:, 3] <= tolerance).all(axis=1)
     return inside
 
 

@@ -13,8 +13,21 @@ from iga_drake.checkpoint import load_checkpoint
 
 SETTINGS = {
     "model": {"scalars": 24, "vectors": 8, "heads": 2, "layers": 2, "descriptor": 16},
-    "training": {"batch": 2, "nodes": 16, "warmup": 2, "bf16": False, "log_every": 1},
-    "samples": {"cloud_points": 64, "surface_points": 400, "least_seen": 8},
+    "training": {
+        "batch": 2,
+        "nodes": 16,
+        "warmup": 2,
+        "bf16": False,
+        "log_every": 1,
+        "scored_samples": 2,
+    },
+    # Deformations that are quick to make.
+    "samples": {
+        "cloud_points": 64,
+        "surface_points": 400,
+        "least_seen": 8,
+        "deformations": [0.5, 0.5, 0.0, 0.0],
+    },
 }
 CLOCK = {"seconds", "samples_per_second", "memory_mib", "workers_mib"}
 

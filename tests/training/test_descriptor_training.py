@@ -22,16 +22,18 @@ from iga_drake.training.descriptor import (
 from iga_drake.training.settings import TrainingError
 
 MODEL = DescriptorConfig(scalars=24, vectors=8, heads=2, layers=2, descriptor=16)
-SAMPLES = SampleConfig(cloud_points=64, surface_points=400, least_seen=8)
+SAMPLES = SampleConfig(
+    cloud_points=64, surface_points=400, least_seen=8, deformations=(0.5, 0.5, 0.0, 0.0)
+)
 
 
 def _config(steps: int, **changes) -> DescriptorTraining:
-    options = {"batch": 2, "nodes": 16, "warmup": 2, "bf16": False}
+    options = {"batch": 2, "nodes": 16, "warmup": 2, "bf16": False, "scored_samples": 2}
     return DescriptorTraining(steps=steps, **(options | changes))
 
 
 def _train(folder: Path, config: DescriptorTraining | None, **options) -> dict:
-    options = {"model": MODEL, "samples": SAMPLES, "validation_count": 2} | options
+    options = {"model": MODEL, "samples": SAMPLES} | options
     return train_descriptor(folder, config=config, **options)
 
 

@@ -1,6 +1,5 @@
 """Occupancy training: learns, goes on after a stop exactly where it was, and is scored rightly."""
 
-import argparse
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ from iga_drake.training import encoder
 from iga_drake.training.encoder import (
     EncoderSettings,
     EncoderTraining,
-    add_arguments,
     always_occupied,
     centre_baseline,
     network_predictor,
@@ -139,19 +137,3 @@ def test_scores_are_those_counted_by_hand() -> None:
         (said & true & box).sum() / ((said | true) & box).sum()
     )
     assert scores["all"]["iou"] == pytest.approx(true.mean())
-
-
-def test_the_command_trains_the_paper_s_sizes_by_default(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    parser = argparse.ArgumentParser()
-    add_arguments(parser)
-    asked: dict = {}
-    monkeypatch.setattr(encoder, "train_encoder", lambda folder, **given: asked.update(given) or {})
-    assert encoder.main(parser.parse_args(["--out", str(tmp_path), "--steps", "7"])) == 0
-    assert asked["encoder"] == EncoderConfig() and asked["decoder"] == DecoderConfig()
-    assert asked["config"] == EncoderTraining(steps=7)
-    light = ["--out", str(tmp_path), "--size", "light", "--query", "projections", "--float32"]
-    encoder.main(parser.parse_args(light))
-    assert asked["encoder"] == EncoderConfig.light() and not asked["config"].bf16
-    assert asked["decoder"] == DecoderConfig(query="projections", width=128)

@@ -168,10 +168,10 @@ def test_drawn_candidates_give_the_same_loss_and_on_average_its_gradient() -> No
 
     value, expected = gradient()
     again, few = gradient(drawn=2)
-    _, many = gradient(drawn=20_000)
+    _, many = gradient(drawn=6_000)
     assert again == pytest.approx(value, rel=1e-5)
     off = [(found - expected).norm() / expected.norm() for found in (few, many)]
-    assert off[0] > 0.1 and off[1] < 0.03
+    assert off[0] > 0.1 and off[1] < 0.05
 
 
 def test_the_gradient_penalty_makes_edges_matter_less() -> None:

@@ -43,7 +43,7 @@ class PaperModel(nn.Module):
         )
 
     def description(self) -> dict:
-        """For a card."""
+        """The part and the sizes, for a checkpoint's card."""
         return {
             "part": self.part,
             "model": dataclasses.asdict(self.graph.config),

@@ -27,8 +27,10 @@ def energy_of(network: GraphNetwork, context: Context, *, bf16: bool = False) ->
 
 
 def distances_of(network: GraphNetwork, context: Context, R: Tensor, t: Tensor) -> Tensor:
-    """(S, M, 2): angle (rad) and distance (units of DISTANCE_UNIT) to the right pose, as a network
-    trained to know them says."""
+    """Angle (rad) and distance (units of DISTANCE_UNIT) to the right pose (S, M, 2).
+
+    They are the predictions of a network that was trained to know them.
+    """
     return torch.nn.functional.softplus(network(context, R, t).float())
 
 

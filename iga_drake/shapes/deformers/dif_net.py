@@ -59,11 +59,19 @@ class DifNetDeformer:
         checked_points: int = 128,
         double: bool = False,
     ) -> None:
-        """net: default, the package's weights. scale: factor of the displacement; latent_scale:
-        factor of the latent's deviation from the mean of the trained ones; interpolate: between
-        two trained latents instead of normal; stretch: sigma of log axis scales, drawn besides;
-        checked_points: at how many vertices folding is looked for (0: nowhere); double: in double
-        precision, of the package's weights."""
+        """Prepares the network. Raises `ShapeError` where it has fewer than two trained latents.
+
+        Args:
+          net: by default with the package's weights.
+          scale: factor of the displacement.
+          latent_scale: factor of the latent's deviation from the mean of the trained ones.
+          interpolate: draws between two trained latents rather than from a normal distribution.
+          stretch: sigma of log axis scales, drawn besides.
+          least_volume: least determinant of the map's Jacobian; the displacement is made smaller
+            until no checked vertex has less.
+          checked_points: vertices at which folding is looked for; 0 looks nowhere.
+          double: takes the package's weights in double precision.
+        """
         self.net = (_landed(default_dif_net_weights(), double) if net is None else net).eval()
         if len(self.net.latents) < 2:
             raise ShapeError(
@@ -80,7 +88,7 @@ class DifNetDeformer:
             self._deviations = self.net.latents - self._mean
 
     def draw_latent(self, rng: np.random.Generator) -> Tensor:
-        """(latent,) in the precision of the network."""
+        """Draws a latent (latent,), in the precision of the network."""
         count = len(self._deviations)
         if self.interpolate:
             i, j = rng.choice(count, 2, replace=False)
@@ -114,7 +122,7 @@ class DifNetDeformer:
         return frame.invert((normalised + scale * moved) * stretch)
 
     def _tensor(self, array: np.ndarray) -> Tensor:
-        """In the precision of the network."""
+        """The array as a tensor in the precision of the network."""
         return torch.from_numpy(array).to(self._mean.dtype)
 
     def _layers(self, latent: Tensor) -> Layers:

@@ -13,7 +13,13 @@ class LatticeDeformer:
     """
 
     def __init__(self, *, amplitude: float = 0.06, scale: float = 0.2, cells: int = 3):
-        """amplitude: displacement sigma relative to the size; scale: sigma of the log scales."""
+        """Sets the deviations of the draws.
+
+        Args:
+          amplitude: sigma of the displacements relative to the shape's size.
+          scale: sigma of the log scales along the axes.
+          cells: of the lattice along each axis.
+        """
         self.amplitude = amplitude
         self.scale = scale
         self.cells = cells

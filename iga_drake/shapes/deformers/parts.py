@@ -41,10 +41,15 @@ class PartDeformer:
         common: float = 0.1,
         blend: float = 0.04,
     ) -> None:
-        """scale: sigma of each part's log scales along its axes; bend: sigma of the sagitta
-        relative to the part's length; taper: sigma of the section's relative change from the joint
-        to the end; common: sigma of the whole shape's log size; blend: sigma of the weights,
-        relative to the shape's size."""
+        """Sets the deviations of the draws.
+
+        Args:
+          scale: sigma of each part's log scales along its axes.
+          bend: sigma of the sagitta relative to the part's length.
+          taper: sigma of the section's relative change from the joint to the end.
+          common: sigma of the whole shape's log size.
+          blend: sigma of the parts' weights, relative to the shape's size.
+        """
         self.scale = scale
         self.bend = bend
         self.taper = taper

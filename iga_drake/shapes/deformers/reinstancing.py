@@ -19,8 +19,13 @@ class ReinstancingDeformer:
     def __init__(
         self, *, spread: float | None = 0.15, families: Mapping[str, Family] | None = None
     ) -> None:
-        """spread: sigma of each parameter relative to its range, about the shape's own
-        parameters; None draws every parameter anew. families: default, all of the package."""
+        """Sets the spread of the parameters.
+
+        Args:
+          spread: sigma of each parameter relative to its range, about the shape's own parameters;
+            None draws every parameter anew.
+          families: by name; by default all of the package.
+        """
         if families is None:
             from iga_drake.shapes.families import FAMILIES
 

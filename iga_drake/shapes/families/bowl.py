@@ -114,7 +114,7 @@ def build(parameters: dict[str, float]) -> ShapeInstance:
 
 
 def _rim_frame(shell: surfaces.ShellProfile) -> np.ndarray:
-    """At the rim's top at azimuth 0: x outwards across the wall, z up along the wall."""
+    """Frame X_OF at the rim's top at azimuth 0, x outwards across the wall, z up along the wall."""
     middle = (shell.outer + shell.inner) / 2
     along = middle[-1] - middle[-4]
     along /= np.linalg.norm(along)
@@ -127,8 +127,10 @@ def _rim_frame(shell: surfaces.ShellProfile) -> np.ndarray:
 
 
 def cavity(shell: surfaces.ShellProfile) -> np.ndarray:
-    """(WALL_POINTS, 2) (r, z) of the cavity that the collision pieces leave free, from the floor's
-    edge to the rim: a little less than inside `shell.inner`."""
+    """Outline (WALL_POINTS, 2) (r, z) m of the cavity that the collision pieces leave free.
+
+    It goes from the floor's edge to the rim, a little inside `shell.inner`.
+    """
     cut = _cut_levels(shell)
     free = np.interp(shell.inner[:, 1], shell.inner[cut, 1], shell.inner[cut, 0])
     radius = np.minimum(free, shell.inner[:, 0]) * CAVITY_SHARE

@@ -48,7 +48,7 @@ class Vessel:
 
     @property
     def rings(self) -> np.ndarray:
-        """(R, S, 3) from the underside over the rim to the floor; a view of the vertices."""
+        """Rings (R, S, 3) m, from the underside over the rim to the floor: views of vertices."""
         return self.surface.vertices[1:-1].reshape(-1, self.segments, 3)
 
     @property
@@ -57,7 +57,7 @@ class Vessel:
         return float(self.surface.vertices[:, 2].max())
 
     def anchor(self, height: float) -> "Anchor":
-        """In the middle of the wall at azimuth 0."""
+        """The anchor in the middle of the wall at a height (m), at azimuth 0."""
         return wall_anchor(self.shell.outer, height, 0.5 * self.thickness)
 
     def part(self, base_cuts: Sequence[int] | None = None) -> Part:

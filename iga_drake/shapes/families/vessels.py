@@ -16,7 +16,7 @@ from iga_drake.shapes.symmetry import Symmetry
 
 
 def _handle_frame(path: np.ndarray) -> np.ndarray:
-    """In the middle of a handle's path (N, 3) in the plane y = 0, x away from its ends."""
+    """X_OF in the middle of a handle's path (N, 3) in the plane y = 0, x away from its ends."""
     middle = len(path) // 2
     along = path[middle + 1] - path[middle - 1]
     outward = np.array([-along[2], 0.0, along[0]])
@@ -25,7 +25,7 @@ def _handle_frame(path: np.ndarray) -> np.ndarray:
 
 
 def _tip_frame(path: np.ndarray) -> np.ndarray:
-    """At the end of a spout's path (N, 3) in the plane y = 0, x along it."""
+    """Frame X_OF at the end of a spout's path (N, 3) in the plane y = 0, x along it."""
     along = path[-1] - path[-2]
     return frame(path[-1], x=along, z=np.cross(along, (0.0, 1.0, 0.0)) * np.sign(-along[0] or 1.0))
 

@@ -6,6 +6,7 @@ share nothing with the families (solid angles, nearest points, hulls).
 
 from collections.abc import Callable
 
+import igl
 import numpy as np
 import trimesh
 from family_checks import inside_pieces, solid_points
@@ -17,6 +18,7 @@ from iga_drake.shapes.instance import ShapeInstance
 DRAWS = 6
 CORNERS = 6
 _instances: dict[str, list[ShapeInstance]] = {}
+_corners: dict[str, list[ShapeInstance]] = {}
 
 
 def draws(family: Family) -> list[ShapeInstance]:
@@ -31,32 +33,21 @@ def draws(family: Family) -> list[ShapeInstance]:
 
 def corners(family: Family) -> list[ShapeInstance]:
     """Products with every parameter at one end of its range: all low, all high, random ends."""
-    rng = np.random.default_rng(7)
-    ends = [np.zeros(len(family.ranges), int), np.ones(len(family.ranges), int)]
-    ends += [rng.integers(0, 2, len(family.ranges)) for _ in range(CORNERS - 2)]
-    return [
-        family.build(
-            {name: limits[k] for k, (name, limits) in zip(end, family.ranges.items(), strict=True)}
-        )
-        for end in ends
-    ]
+    if family.name not in _corners:
+        rng = np.random.default_rng(7)
+        ends = [np.zeros(len(family.ranges), int), np.ones(len(family.ranges), int)]
+        ends += [rng.integers(0, 2, len(family.ranges)) for _ in range(CORNERS - 2)]
+        limits = family.ranges.items()
+        _corners[family.name] = [
+            family.build({name: both[k] for k, (name, both) in zip(end, limits, strict=True)})
+            for end in ends
+        ]
+    return _corners[family.name]
 
 
 def winding_numbers(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(P,) how often the surface encloses each point, by solid angles (Van Oosterom, Strackee)."""
-    total = np.zeros(len(points))
-    for part in np.array_split(np.arange(len(faces)), max(1, len(faces) * len(points) // 400_000)):
-        a, b, c = (vertices[faces[part, k]][None] - points[:, None] for k in range(3))
-        la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
-        above = np.einsum("pfd,pfd->pf", a, np.cross(b, c))
-        below = (
-            la * lb * lc
-            + np.einsum("pfd,pfd->pf", a, b) * lc
-            + np.einsum("pfd,pfd->pf", b, c) * la
-            + np.einsum("pfd,pfd->pf", c, a) * lb
-        )
-        total += np.arctan2(above, below).sum(axis=1)
-    return total / (2 * np.pi)
+    """(P,) how often the surface encloses each point, by solid angles (libigl)."""
+    return igl.winding_number(vertices, np.ascontiguousarray(faces), np.ascontiguousarray(points))
 
 
 def components(instance: ShapeInstance) -> list[np.ndarray]:
@@ -152,28 +143,34 @@ def check_pieces_cover_the_solid_and_leave_cavities_free(family: Family) -> None
         assert share < 0.006, f"pieces fill {share:.4f} beside {instance.parameters}"
 
 
-def turned_distance(instance: ShapeInstance, R: np.ndarray, about: np.ndarray) -> float:
-    """Mean distance of the surface, turned by R about a point, from itself, relative to size."""
+def turned_distances(
+    instance: ShapeInstance, rotations: np.ndarray, about: np.ndarray
+) -> np.ndarray:
+    """(n,) mean distance of the surface, turned by rotations (n, 3, 3) about a point, from itself,
+    relative to its size."""
     skin, index = trimesh.sample.sample_surface(instance.mesh, 12000, seed=1)
     normals = instance.mesh.face_normals[index]
-    turned = (skin[::10] - about) @ R.T + about
-    distance, nearest = cKDTree(skin).query(turned)
+    tree = cKDTree(skin)
     # Near the surface along the nearest sample's normal: the samples' spacing doesn't count.
     spacing = np.sqrt(instance.mesh.area / len(skin))
-    off = np.abs(np.einsum("pd,pd->p", turned - skin[nearest], normals[nearest]))
-    distance = np.where(distance < 2 * spacing, off, distance)
-    return float(distance.mean() / instance.mesh.extents.max())
+    found = []
+    for R in rotations:
+        turned = (skin[::10] - about) @ R.T + about
+        distance, nearest = tree.query(turned)
+        off = np.abs(np.einsum("pd,pd->p", turned - skin[nearest], normals[nearest]))
+        found.append(np.where(distance < 2 * spacing, off, distance).mean())
+    return np.array(found) / instance.mesh.extents.max()
 
 
 def half_turns(instance: ShapeInstance) -> np.ndarray:
-    """(6,) `turned_distance` of half turns about the centroid: principal axes, then O's axes."""
+    """(6,) `turned_distances` of half turns about the centroid: principal axes, then O's axes."""
     centre = instance.mesh.triangles_center
     weight = instance.mesh.area_faces / instance.mesh.area_faces.sum()
     centroid = weight @ centre
     spread = (centre - centroid).T @ ((centre - centroid) * weight[:, None])
     axes = np.concatenate([np.linalg.eigh(spread)[1].T, np.eye(3)])
     turns = 2 * axes[:, :, None] * axes[:, None] - np.eye(3)
-    return np.array([turned_distance(instance, R, centroid) for R in turns])
+    return turned_distances(instance, turns, centroid)
 
 
 def check_declared_symmetry(family: Family) -> None:
@@ -183,8 +180,8 @@ def check_declared_symmetry(family: Family) -> None:
         return
     limit = 0.005 if family.symmetry.exact else 0.05
     for instance in draws(family):
-        for R in family.symmetry.rotations(steps=5)[1:]:
-            assert turned_distance(instance, R, np.zeros(3)) < limit
+        turns = family.symmetry.rotations(steps=5)[1:]
+        assert turned_distances(instance, turns, np.zeros(3)).max() < limit
 
 
 def check_products_differ(family: Family) -> None:
