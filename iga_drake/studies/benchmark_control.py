@@ -1,5 +1,5 @@
-"""`iga benchmark control`: wall-clock time between two commands to the arm at real-time rate 1, while
-an inference runs and no image is taken, beside a loop that waits for it.
+"""`iga benchmark control`: wall-clock time between two commands to the arm at real-time rate 1,
+while an inference runs and no image is taken, beside a loop that waits for it.
 
 The aligner is one that another package brings: it computes for as long as it is told, in the worker
 process. The same scene is stepped with `policy.inference` concurrent, then lockstep.

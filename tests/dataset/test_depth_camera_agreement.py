@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from iga_drake.dataset.depth_camera import visible
 from iga_drake.shapes.families import FAMILIES
-from iga_drake.station.simulated.cameras import add_renderer, look_at
+from iga_drake.station.cameras.rgbd import add_renderer, look_at
 
 # Drake's renderer looks through the middle of a pixel: the first one's is (0.5, 0.5).
 INFO = CameraInfo(848, 480, 615.0, 615.0, 424.0, 240.0)
