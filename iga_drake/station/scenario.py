@@ -5,6 +5,7 @@ states only what differs from it. SI units throughout (m, rad, s, N); W is the w
 """
 
 import dataclasses
+import functools
 import hashlib
 import json
 import math
@@ -13,6 +14,7 @@ import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load, yaml_load_typed
@@ -139,8 +141,9 @@ class Scenario:
     plant: MultibodyPlantConfig = field(default_factory=_plant)
     panda: Panda = field(default_factory=Panda)
     table: Table = field(default_factory=Table)
-    # Name -> camera, at least one. A file that has this section states all cameras it wants.
-    cameras: dict[str, camera_type()] = field(default_factory=_cameras)  # type: ignore[valid-type]
+    # Name -> camera of any kind, at least one. A file that has this section states all cameras it
+    # wants; what is no plain RGB-D camera has a tag, the name of its kind's class.
+    cameras: dict[str, RgbdCamera] = field(default_factory=_cameras)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     planning: PlanningConfig = field(default_factory=PlanningConfig)
     control: WaypointFollowerConfig = field(default_factory=WaypointFollowerConfig)
@@ -168,7 +171,16 @@ class Scenario:
 
     def to_yaml(self) -> str:
         """The whole scenario, defaults included, as text that `load_scenario` reads back."""
+        _allow_all_cameras()
         return yaml_dump_typed(self, schema=Scenario)
+
+
+@functools.cache
+def _allow_all_cameras() -> None:
+    """Lets files name every kind of camera that there is. Not when this module is imported: a kind
+    of another package may import it in turn."""
+    kinds: Any = camera_type()
+    Scenario.__dataclass_fields__["cameras"].type = dict[str, kinds]
 
 
 def load_scenario(
@@ -185,6 +197,7 @@ def load_scenario(
     is unknown (the valid ones are listed) or stated twice, a value of a wrong type and a value out
     of its range.
     """
+    _allow_all_cameras()
     scenario = Scenario()
     for file in (path, *overlays):
         file = scenario_path(file)
@@ -196,7 +209,7 @@ def load_scenario(
             ) from e
         scenario = _layered(scenario, text, str(file))
     for override in overrides:
-        scenario = _layered(scenario, _override_text(override), override, keep_maps=True)
+        scenario = _layered(scenario, _override_text(override, scenario), override, keep_maps=True)
     return scenario
 
 
@@ -212,16 +225,30 @@ def scenario_path(name: str | Path) -> Path:
     return path
 
 
-def _override_text(override: str) -> str:
-    """ "a.b=c" as YAML."""
+def _override_text(override: str, scenario: Scenario) -> str:
+    """The setting "a.b=c" as YAML; what is one of several types in the scenario stays that type."""
     key, found, value = override.partition("=")
     names = key.strip().split(".")
     if not found or not all(names):
         raise ScenarioError(
             f"{override}: expected key.path=value, such as control.linear_speed=0.1"
         )
-    braces = "".join(f"{{{json.dumps(name)}: " for name in names)
-    return f"{braces}{value}{'}' * len(names)}"
+    text = ""
+    now: Any = scenario
+    schema: Any = Scenario
+    for name in names:
+        tag = f"!{type(now).__name__} " if _is_union(schema) and now is not None else ""
+        text += f"{tag}{{{json.dumps(name)}: "
+        fields = _fields(type(now))
+        if isinstance(now, dict):
+            now, schema = now.get(name), (*typing.get_args(schema), Any)[1]
+        else:
+            now, schema = getattr(now, name, None), (fields or {}).get(name, Any)
+    return f"{text}{value}{'}' * len(names)}"
+
+
+def _is_union(schema: Any) -> bool:
+    return typing.get_origin(schema) in (typing.Union, types.UnionType)
 
 
 def _layered(scenario: Scenario, text: str, where: str, *, keep_maps: bool = False) -> Scenario:
