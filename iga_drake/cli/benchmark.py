@@ -2,19 +2,19 @@
 
 import argparse
 
-from iga_drake.cli.parts import Part, add_parts, run_part
+from iga_drake.cli.subcommands import Subcommand, add_subcommands, run_subcommand
 
-PARTS = {
-    name: Part(f"iga_drake.studies.benchmark_{name.replace('-', '_')}")
+SUBCOMMANDS = {
+    name: Subcommand(f"iga_drake.studies.benchmark_{name.replace('-', '_')}")
     for name in ("control", "data", "fusion", "inference", "ik", "paper-energy")
 }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What is timed; the rest are its own options."""
-    add_parts(parser, PARTS)
+    add_subcommands(parser, SUBCOMMANDS)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Times it."""
-    return run_part("benchmark", PARTS, arguments)
+    return run_subcommand("benchmark", SUBCOMMANDS, arguments)

@@ -2,24 +2,28 @@
 
 import argparse
 
-from iga_drake.cli.parts import Part, add_parts, run_part
+from iga_drake.cli.subcommands import Subcommand, add_subcommands, run_subcommand
 
-PARTS = {
-    "tasks": Part("iga_drake.cli.evaluate_tasks"),
-    "alignment": Part("iga_drake.cli.evaluate_alignment"),
-    "ablations": Part("iga_drake.studies.ablations", "add_ablations", "evaluate_ablations"),
-    "compare": Part("iga_drake.studies.compare", "add_compare", "evaluate_compare"),
-    "deformations": Part(
+SUBCOMMANDS = {
+    "tasks": Subcommand("iga_drake.cli.evaluate_tasks"),
+    "alignment": Subcommand("iga_drake.cli.evaluate_alignment"),
+    "ablations": Subcommand("iga_drake.studies.ablations", "add_ablations", "evaluate_ablations"),
+    "compare": Subcommand("iga_drake.studies.compare", "add_compare", "evaluate_compare"),
+    "deformations": Subcommand(
         "iga_drake.studies.deformations", "add_evaluate_deformations", "evaluate_deformations"
     ),
-    "diagnosis": Part(
+    "diagnosis": Subcommand(
         "iga_drake.studies.diagnosis", "add_evaluate_diagnosis", "evaluate_diagnosis"
     ),
-    "diversity": Part("iga_drake.studies.scaling", "add_evaluate_diversity", "evaluate_diversity"),
-    "familiarity": Part("iga_drake.studies.familiarity"),
-    "scaling": Part("iga_drake.studies.scaling", "add_evaluate_scaling", "evaluate_scaling"),
-    "stabilisers": Part("iga_drake.studies.stabilisers", "add_stabilisers", "evaluate_stabilisers"),
-    "training-log": Part(
+    "diversity": Subcommand(
+        "iga_drake.studies.scaling", "add_evaluate_diversity", "evaluate_diversity"
+    ),
+    "familiarity": Subcommand("iga_drake.studies.familiarity"),
+    "scaling": Subcommand("iga_drake.studies.scaling", "add_evaluate_scaling", "evaluate_scaling"),
+    "stabilisers": Subcommand(
+        "iga_drake.studies.stabilisers", "add_stabilisers", "evaluate_stabilisers"
+    ),
+    "training-log": Subcommand(
         "iga_drake.studies.training_log", "add_training_log", "evaluate_training_log"
     ),
 }
@@ -27,9 +31,9 @@ PARTS = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What is evaluated; the rest are its own options."""
-    add_parts(parser, PARTS)
+    add_subcommands(parser, SUBCOMMANDS)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluates it."""
-    return run_part("evaluate", PARTS, arguments)
+    return run_subcommand("evaluate", SUBCOMMANDS, arguments)

@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Runs the trials, tells each verdict, prints the table."""
     from iga_drake.evaluation.results import ResultsStore
-    from iga_drake.evaluation.task_success import evaluate, format_table, summarise
+    from iga_drake.evaluation.task_success import evaluate, format_table, summarise_trials
 
     if arguments.trials < 1:
         raise CommandError(f"--trials {arguments.trials}: at least 1 is needed")
@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> None:
         _trials(arguments), processes=arguments.processes, store=store, on_result=_show
     )
     if arguments.json:
-        document = {"summary": summarise(results), "trials": [asdict(r) for r in results]}
+        document = {"summary": summarise_trials(results), "trials": [asdict(r) for r in results]}
         print(json.dumps(document, indent=2))
     else:
         print(format_table(results))

@@ -2,17 +2,17 @@
 
 import argparse
 
-from iga_drake.cli.parts import Part, add_parts, run_part
+from iga_drake.cli.subcommands import Subcommand, add_subcommands, run_subcommand
 
-PARTS = {
-    "demonstrations": Part("iga_drake.cli.view_demonstrations"),
-    "shapes": Part("iga_drake.viewing.shape_sheets", "add_view_shapes", "view_shapes"),
-    "dataset": Part("iga_drake.viewing.dataset_views", "add_view_dataset", "view_dataset"),
-    "deformations": Part(
+SUBCOMMANDS = {
+    "demonstrations": Subcommand("iga_drake.cli.view_demonstrations"),
+    "shapes": Subcommand("iga_drake.viewing.shape_sheets", "add_view_shapes", "view_shapes"),
+    "dataset": Subcommand("iga_drake.viewing.dataset_views", "add_view_dataset", "view_dataset"),
+    "deformations": Subcommand(
         "iga_drake.studies.deformations", "add_view_deformations", "view_deformations"
     ),
-    "energy": Part("iga_drake.studies.energy_views", "add_view_energy", "view_energy"),
-    "reconstruction": Part(
+    "energy": Subcommand("iga_drake.studies.energy_views", "add_view_energy", "view_energy"),
+    "reconstruction": Subcommand(
         "iga_drake.studies.encoder_views", "add_view_reconstruction", "view_reconstruction"
     ),
 }
@@ -20,9 +20,9 @@ PARTS = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What is looked at; the rest are its own options."""
-    add_parts(parser, PARTS)
+    add_subcommands(parser, SUBCOMMANDS)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Shows it."""
-    return run_part("view", PARTS, arguments)
+    return run_subcommand("view", SUBCOMMANDS, arguments)

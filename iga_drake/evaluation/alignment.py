@@ -192,10 +192,10 @@ def evaluate_alignment(
         rows.append(row)
     if not rows:
         raise IgaDrakeError(f"{name}, set '{split}': no answer in {count} samples")
-    return summarise(rows), rows
+    return summarise_errors(rows), rows
 
 
-def summarise(rows: Iterable[SampleErrors]) -> AlignmentErrors:
+def summarise_errors(rows: Iterable[SampleErrors]) -> AlignmentErrors:
     """Means over rows of one aligner and one set."""
     rows = list(rows)
     table = np.array(

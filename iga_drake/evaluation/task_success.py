@@ -172,7 +172,7 @@ def _median(values: Iterable[float | None]) -> float | None:
     return present[len(present) // 2] if present else None
 
 
-def summarise(results: Sequence[TrialResult]) -> list[dict[str, Any]]:
+def summarise_trials(results: Sequence[TrialResult]) -> list[dict[str, Any]]:
     """One row for each scenario and aligner, in the order of their first result."""
     rows = []
     for scenario, aligner in dict.fromkeys((r.scenario, r.aligner) for r in results):
@@ -205,7 +205,7 @@ def summarise(results: Sequence[TrialResult]) -> list[dict[str, Any]]:
 
 def format_table(results: Sequence[TrialResult]) -> str:
     """The summary as text: one line for each scenario and aligner, then each failure's cause."""
-    rows = summarise(results)
+    rows = summarise_trials(results)
     wide = max(8, *(len(row["scenario"]) for row in rows))
     name_wide = max(8, *(len(row["aligner"]) for row in rows))
     lines = [

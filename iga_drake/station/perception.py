@@ -11,9 +11,7 @@ def add_fusion(builder: DiagramBuilder, station: Diagram, scenario: Scenario) ->
     """Adds the system "fusion", connected to all cameras of `station`, as the scenario sets it."""
     cameras = {name: camera_info(camera.intrinsics) for name, camera in scenario.cameras.items()}
     fusion = builder.AddNamedSystem("fusion", PointCloudFusion(cameras, scenario.fusion))
-    for name in scenario.camera_names:
-        for port in ("depth_image", "label_image", "pose", "time"):
-            builder.Connect(
-                station.GetOutputPort(f"{name}.{port}"), fusion.GetInputPort(f"{name}.{port}")
-            )
+    for index in range(fusion.num_input_ports()):
+        port = fusion.get_input_port(index)
+        builder.Connect(station.GetOutputPort(port.get_name()), port)
     return fusion

@@ -97,7 +97,7 @@ def _cameras() -> dict[str, RgbdCamera]:
 
 
 @dataclass
-class Task:
+class TaskChoice:
     """Which task is done."""
 
     # Name in the task registry of `iga_drake.tasks`.
@@ -107,7 +107,7 @@ class Task:
 
 
 @dataclass
-class Aligner:
+class AlignerChoice:
     """Which alignment method predicts the waypoints."""
 
     # Name in the aligner registry of `iga_drake.aligners`.
@@ -150,8 +150,8 @@ class Scenario:
     differential_ik: DifferentialIkConfig = field(default_factory=DifferentialIkConfig)
     supervisor: SupervisorConfig = field(default_factory=SupervisorConfig)
     policy: PolicyConfig = field(default_factory=PolicyConfig)
-    task: Task = field(default_factory=Task)
-    aligner: Aligner = field(default_factory=Aligner)
+    task: TaskChoice = field(default_factory=TaskChoice)
+    aligner: AlignerChoice = field(default_factory=AlignerChoice)
     # Folder with the demonstrations; a relative path starts at `models/`.
     demonstrations: str = "demonstrations/grasp"
     # How many of them, from the first on, make up the aligner's context; all where there are fewer.

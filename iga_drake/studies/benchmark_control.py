@@ -98,7 +98,9 @@ class _Watch:
         return EventStatus.DidNothing()
 
 
-def measure(way: str, *, inferences: int, seconds: float, scenario_name: str = "grasp") -> Gaps:
+def measure_gaps(
+    way: str, *, inferences: int, seconds: float, scenario_name: str = "grasp"
+) -> Gaps:
     """Steps the scenario's diagram through `inferences` inferences of `seconds` each.
 
     `way` is the scenario's `policy.inference`. One that isn't done is begun anew from the start.
@@ -168,7 +170,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise IgaDrakeError("--inferences and --seconds have to be above 0")
     with _busy_package():
         ours, waiting = (
-            measure(way, inferences=count, seconds=arguments.seconds)
+            measure_gaps(way, inferences=count, seconds=arguments.seconds)
             for way, count in (("concurrent", arguments.inferences), ("lockstep", 1))
         )
     ratio = waiting.longest / ours.longest

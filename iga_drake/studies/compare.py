@@ -292,7 +292,7 @@ def compare(
     )
 
 
-def model_card(rows: Sequence[Compared], cards: dict[str, dict], frames: str) -> str:
+def comparison_card(rows: Sequence[Compared], cards: dict[str, dict], frames: str) -> str:
     """Markdown: how networks were trained (from their own cards) and what they are off by."""
     lines = ["# " + ", ".join(cards), ""]
     for title, card in cards.items():
@@ -430,4 +430,4 @@ def evaluate_compare(arguments: argparse.Namespace) -> None:
         weights = arguments.weights[-1][1] if arguments.weights else None
         cards = {kind_of(part): _card(part, weights, names[0]) for part in PARTS[names[0]]}
         some = [row for row in rows if row.weights == rows[-1].weights]
-        write_text(arguments.card, model_card(some, cards, arguments.frames))
+        write_text(arguments.card, comparison_card(some, cards, arguments.frames))

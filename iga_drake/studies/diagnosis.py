@@ -359,7 +359,7 @@ class Summary:
         return "\n".join(lines)
 
 
-def summarise(rows: Iterable[Diagnosis]) -> Summary:
+def summarise_diagnoses(rows: Iterable[Diagnosis]) -> Summary:
     """Over the samples of one set."""
     rows = list(rows)
     objects = [o for row in rows for o in row.objects]
@@ -428,7 +428,7 @@ def evaluate_diagnosis(arguments: argparse.Namespace) -> int:
     document = []
     for split in arguments.sets:
         rows = [diagnose_sample(aligner, split, index) for index in range(arguments.count)]
-        summary = summarise(rows)
+        summary = summarise_diagnoses(rows)
         if arguments.json:
             document.append({**asdict(summary), "samples": [asdict(row) for row in rows]})
         else:

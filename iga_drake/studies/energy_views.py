@@ -40,7 +40,7 @@ VIEW = np.array([[-0.64, 0.77, 0.0], [-0.30, -0.25, 0.92]])  # (2, 3) across and
 
 
 @dataclass(frozen=True)
-class Scene:
+class ExplainedProblem:
     """A problem, what was found and why, and the right answer."""
 
     name: str
@@ -49,13 +49,17 @@ class Scene:
     truth: np.ndarray  # (4, 4) X_WF of the valid answer of the lowest energy
 
     @staticmethod
-    def of(aligner: IgaAligner, split: str, index: int, demonstrations: int | None) -> "Scene":
+    def of(
+        aligner: IgaAligner, split: str, index: int, demonstrations: int | None
+    ) -> "ExplainedProblem":
         """Sample `index` of a set."""
         problem = Problem.of(split, index, demonstrations)
         explanation = aligner.explain(*problem.query.clouds, seed=index)
         valid = problem.valid()
         energies = explanation.energy(torch.from_numpy(valid))
-        return Scene(f"{split} {index}", problem, explanation, valid[int(energies.argmin())])
+        return ExplainedProblem(
+            f"{split} {index}", problem, explanation, valid[int(energies.argmin())]
+        )
 
     @property
     def best(self) -> Tensor:
@@ -136,18 +140,18 @@ def landscape(
     )
 
 
-def landscape_figure(scene: Scene, field: Landscape, path: Path) -> None:
+def landscape_figure(explained: ExplainedProblem, field: Landscape, path: Path) -> None:
     """Heat maps of the plane and of the axis, curves of turns; the truth and the modes marked."""
     figure, (plane, screw, curves) = new_figure(1, 3, inches=4.4)
     low = float(min(field.plane.min(), field.screw.min(), field.curves.min()))
     cm, degrees = 100 * field.offsets, np.degrees(field.angles)
     _heat(plane, cm, cm, field.plane.T, low)
     plane.contour(cm, cm, field.plane.T, low + np.array([1, 2, 5, 10]), colors="k", linewidths=0.4)
-    shift = shift_along(scene, scene.truth, field.axes)
+    shift = shift_along(explained, explained.truth, field.axes)
     plane.plot(0, 0, "k+", ms=10, mew=2, label="found; circles: other modes")
     plane.plot(*shift[:2], "r*", ms=10, label=f"truth ({shift[2]:+.1f} cm off the plane)")
-    for k, X in enumerate(scene.explanation.estimate.poses[1:], 1):
-        other = shift_along(scene, X, field.axes)
+    for k, X in enumerate(explained.explanation.estimate.poses[1:], 1):
+        other = shift_along(explained, X, field.axes)
         if max(abs(other[:2])) < 100 * REACH:
             plane.plot(*other[:2], "ko", mfc="none", ms=5, mew=0.7)
             plane.text(other[0], other[1], f" {k}", color="k", fontsize=7)
@@ -171,7 +175,7 @@ def landscape_figure(scene: Scene, field: Landscape, path: Path) -> None:
     )  # fmt: skip
     curves.legend(fontsize=7)
     curves.grid(alpha=0.3)
-    figure.suptitle(scene.name, fontsize=9)
+    figure.suptitle(explained.name, fontsize=9)
     write_figure(figure, path)
 
 
@@ -181,10 +185,10 @@ def _heat(panel: "Axes", x: np.ndarray, y: np.ndarray, values: np.ndarray, low: 
     )
 
 
-def shift_along(scene: Scene, X: np.ndarray, axes: Tensor) -> np.ndarray:
+def shift_along(explained: ExplainedProblem, X: np.ndarray, axes: Tensor) -> np.ndarray:
     """(3,) cm along axes (3, 3): from the centre of A in the best mode to that at pose X."""
     other = torch.from_numpy(X)
-    off = (other - scene.best)[:3, :3] @ scene.centre + (other - scene.best)[:3, 3]
+    off = (other - explained.best)[:3, :3] @ explained.centre + (other - explained.best)[:3, 3]
     return 100 * (axes @ off).numpy()
 
 
@@ -217,19 +221,19 @@ def _clouds(query: Query, role: int) -> tuple[np.ndarray, list[np.ndarray]]:
     return query.target, [a.target for a in query.context]
 
 
-def correspondence_figure(scene: Scene, path: Path) -> None:
+def correspondence_figure(explained: ExplainedProblem, path: Path) -> None:
     """Of each object and demonstration: the test cloud (left), the demonstration's, turned as the
     test cloud lies, and lines between matches, coloured by confidence."""
     from matplotlib.collections import LineCollection
 
-    demonstrations = len(scene.problem.query.context)
+    demonstrations = len(explained.problem.query.context)
     figure, panels = new_figure(2, demonstrations, inches=3.4)
     lines = None
     for role, name in enumerate("AB"):
-        test, clouds = _clouds(scene.problem.query, role)
+        test, clouds = _clouds(explained.problem.query, role)
         for d, cloud in enumerate(clouds):
             panel = panels[role * demonstrations + d]
-            matches = match_lines(scene.explanation, role, d)
+            matches = match_lines(explained.explanation, role, d)
             left, ends = ((p - test.mean(0)) @ VIEW.T for p in (test, matches.test))
             right, heads = (
                 (p - cloud.mean(0)) @ matches.R_TD.T @ VIEW.T
@@ -245,22 +249,22 @@ def correspondence_figure(scene: Scene, path: Path) -> None:
             panel.add_collection(lines)
             panel.set_aspect("equal")
             panel.set_axis_off()
-            category = scene.problem.sample.category[role]
+            category = explained.problem.sample.category[role]
             panel.set_title(f"{name} {category}, demonstration {d}", fontsize=8)
     if lines is not None:
         figure.colorbar(lines, ax=panels, label="probability of the match", shrink=0.7)
-    figure.suptitle(f"{scene.name}: test cloud orange, demonstration blue", fontsize=9)
+    figure.suptitle(f"{explained.name}: test cloud orange, demonstration blue", fontsize=9)
     write_figure(figure, path)
 
 
-def pair_figure(scene: Scene, path: Path) -> None:
+def pair_figure(explained: ExplainedProblem, path: Path) -> None:
     """Shares of the pairs of parts in the best mode, and of the parts on the clouds."""
     figure, (matrix, place, other) = new_figure(1, 3, inches=4.4)
-    weights = scene.explanation.pair_weights(scene.best).numpy()
+    weights = explained.explanation.pair_weights(explained.best).numpy()
     image = matrix.imshow(weights, cmap="magma_r", aspect="auto")
     figure.colorbar(image, ax=matrix, label="share of the support")
     matrix.set(title="Pairs of parts", xlabel="part of B", ylabel="part of A")
-    A, B, parts = _posed_parts(scene, weights)
+    A, B, parts = _posed_parts(explained, weights)
     middle = B.mean(0)
     sights = (VIEW, np.array([[0.77, 0.64, 0.0], [-0.25, 0.30, 0.92]]))  # a quarter turn between
     for panel, sight in zip((place, other), sights, strict=True):
@@ -276,7 +280,7 @@ def pair_figure(scene: Scene, path: Path) -> None:
         panel.set_ylim(*_at_least(panel.get_ylim(), 0.15))
     place.set_title("Parts by their share")
     other.set_title("A quarter turn on")
-    figure.suptitle(f"{scene.name}: A at the best mode orange, B blue", fontsize=9)
+    figure.suptitle(f"{explained.name}: A at the best mode orange, B blue", fontsize=9)
     write_figure(figure, path)
 
 
@@ -287,31 +291,31 @@ def _at_least(limits: tuple[float, float], span: float) -> tuple[float, float]:
 
 
 def _posed_parts(
-    scene: Scene, weights: np.ndarray
+    explained: ExplainedProblem, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray, str]]]:
     """In W: A's cloud at the best mode, B's, and of both their parts, shares and a colour."""
-    X = scene.best.numpy()
-    A = scene.problem.query.grasped @ X[:3, :3].T + X[:3, 3]
+    X = explained.best.numpy()
+    A = explained.problem.query.grasped @ X[:3, :3].T + X[:3, 3]
     P, Q = weights.shape
-    nodes = scene.explanation.nodes[:, -1].numpy()
+    nodes = explained.explanation.nodes[:, -1].numpy()
     parts_A = nodes[0, :P] @ X[:3, :3].T + X[:3, 3]
     return (
         A,
-        scene.problem.query.target,
+        explained.problem.query.target,
         [(parts_A, weights.sum(1), "C1"), (nodes[1, :Q], weights.sum(0), "C0")],
     )
 
 
-def write_figures(scene: Scene, field: Landscape, folder: Path) -> list[Path]:
+def write_figures(explained: ExplainedProblem, field: Landscape, folder: Path) -> list[Path]:
     """Writes all figures as PNG; returns their paths."""
     paths = [folder / f"{name}.png" for name in ("landscape", "correspondences", "pairs")]
-    landscape_figure(scene, field, paths[0])
-    correspondence_figure(scene, paths[1])
-    pair_figure(scene, paths[2])
+    landscape_figure(explained, field, paths[0])
+    correspondence_figure(explained, paths[1])
+    pair_figure(explained, paths[2])
     return paths
 
 
-def show_scene(meshcat, scene: Scene, field: Landscape) -> None:
+def show_explained(meshcat, explained: ExplainedProblem, field: Landscape) -> None:
     """Shows in a `pydrake.geometry.Meshcat`: the test pair with its modes, the demonstrations
     behind it, matches as lines (red: sure, blue: a guess), parts by their share, the plane of
     translations coloured by energy."""
@@ -330,7 +334,7 @@ def show_scene(meshcat, scene: Scene, field: Landscape) -> None:
         meshcat.SetProperty(hidden, "visible", False)
     for shade in ("top_color", "bottom_color"):
         meshcat.SetProperty("/Background", shade, [1.0, 1.0, 1.0])
-    query, explanation = scene.problem.query, scene.explanation
+    query, explanation = explained.problem.query, explained.explanation
     estimate = explanation.estimate
     middle = query.target.mean(0)
     show_cloud(meshcat, f"{root}/test/target cloud", query.target - middle, TARGET_COLOR)
@@ -341,12 +345,12 @@ def show_scene(meshcat, scene: Scene, field: Landscape) -> None:
             meshcat, f"{root}/modes/{name}", moved, PREDICTED_COLOR if k == 0 else GRASPED_COLOR
         )
         meshcat.SetProperty(f"{root}/modes/{name}", "visible", k == 0)
-    truth = query.grasped @ scene.truth[:3, :3].T + scene.truth[:3, 3] - middle
+    truth = query.grasped @ explained.truth[:3, :3].T + explained.truth[:3, 3] - middle
     show_cloud(meshcat, f"{root}/truth", truth, Rgba(0.4, 0.4, 0.4, 1.0))
     meshcat.SetProperty(f"{root}/truth", "visible", False)
-    _show_parts(meshcat, f"{root}/parts", scene, middle)
-    _show_plane(meshcat, f"{root}/landscape", scene, field, middle)
-    posed = scene.best.numpy()
+    _show_parts(meshcat, f"{root}/parts", explained, middle)
+    _show_plane(meshcat, f"{root}/landscape", explained, field, middle)
+    posed = explained.best.numpy()
     everything = np.concatenate([query.target - middle, truth])
     spacing = 1.2 * float(np.ptp(everything, axis=0).max()) + 0.05
     count = len(query.context)
@@ -387,21 +391,23 @@ def _levels(
     ]
 
 
-def _show_parts(meshcat, path: str, scene: Scene, middle: np.ndarray) -> None:
+def _show_parts(meshcat, path: str, explained: ExplainedProblem, middle: np.ndarray) -> None:
     from pydrake.geometry import Rgba
 
     from iga_drake.viewing.replay import show_cloud
 
-    weights = scene.explanation.pair_weights(scene.best).numpy()
-    for name, (nodes, share, _) in zip("AB", _posed_parts(scene, weights)[2], strict=True):
+    weights = explained.explanation.pair_weights(explained.best).numpy()
+    for name, (nodes, share, _) in zip("AB", _posed_parts(explained, weights)[2], strict=True):
         for level, color, some in _levels(share, max(float(share.max()), 1e-9)):
             show_cloud(meshcat, f"{path}/{name}/{level}", nodes[some] - middle, Rgba(*color), 0.012)
 
 
-def _show_plane(meshcat, path: str, scene: Scene, field: Landscape, middle: np.ndarray) -> None:
+def _show_plane(
+    meshcat, path: str, explained: ExplainedProblem, field: Landscape, middle: np.ndarray
+) -> None:
     from matplotlib import colormaps
 
-    at = (scene.best[:3, :3] @ scene.centre + scene.best[:3, 3]).numpy() - middle
+    at = (explained.best[:3, :3] @ explained.centre + explained.best[:3, 3]).numpy() - middle
     u, v = np.meshgrid(field.offsets, field.offsets, indexing="ij")
     axes = field.axes.numpy()
     vertices = at + u.reshape(-1, 1) * axes[0] + v.reshape(-1, 1) * axes[1]
@@ -446,21 +452,21 @@ def view_energy(arguments: argparse.Namespace) -> int:
             f"{chosen.pairs - 1}"
         )
     check_figure((arguments.out or Path()) / "landscape.png")
-    scene = Scene.of(
+    explained = ExplainedProblem.of(
         IgaAligner(weights=arguments.weights),
         arguments.split,
         arguments.index,
         arguments.demonstrations,
     )
-    print(scene.text(), flush=True)
-    field = landscape(scene.explanation.energy, scene.best, scene.centre)
+    print(explained.text(), flush=True)
+    field = landscape(explained.explanation.energy, explained.best, explained.centre)
     if arguments.out:
-        for path in write_figures(scene, field, arguments.out):
+        for path in write_figures(explained, field, arguments.out):
             print(f"written: {path}")
     if arguments.html or not arguments.out:
         from iga_drake.viewing.replay import quiet_meshcat, write_or_serve
 
         meshcat = quiet_meshcat()
-        show_scene(meshcat, scene, field)
+        show_explained(meshcat, explained, field)
         write_or_serve(meshcat, arguments.html)
     return 0

@@ -69,7 +69,7 @@ class Familiarity:
         return "\n".join(lines)
 
 
-def measure(aligner: Aligner, split: str, count: int) -> Familiarity:
+def measure_familiarity(aligner: Aligner, split: str, count: int) -> Familiarity:
     """Over the first `count` samples of a set. Raises `IgaDrakeError` for an aligner that can't
     tell."""
     own: list[float] = []
@@ -107,7 +107,7 @@ def run(arguments: argparse.Namespace, aligner: Aligner | None = None) -> int:
     aligner = aligner or IgaAligner()
     document = []
     for name in names:
-        found = measure(aligner, name, arguments.count)
+        found = measure_familiarity(aligner, name, arguments.count)
         if arguments.json:
             document.append(asdict(found) | {"area": found.area()})
         else:

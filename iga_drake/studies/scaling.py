@@ -133,7 +133,7 @@ def counts(explanation: Explanation, *, cross: bool) -> dict[str, int]:
     }
 
 
-def measure(
+def measure_costs(
     aligner: IgaAligner,
     numbers: Sequence[int],
     count: int,
@@ -339,7 +339,7 @@ def add_evaluate_scaling(parser: argparse.ArgumentParser) -> None:
 def evaluate_scaling(arguments: argparse.Namespace) -> int:
     """Runs `iga evaluate scaling`; returns the exit status."""
     check_figure(arguments.png)
-    costs = measure(
+    costs = measure_costs(
         IgaAligner(weights=arguments.weights), arguments.demonstrations, arguments.count
     )
     exponents = growths(costs)

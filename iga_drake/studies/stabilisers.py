@@ -38,7 +38,7 @@ ABLATIONS = ("all", "no-spectral", "no-energy-penalty", "no-gradient-penalty", "
 
 
 @dataclass(frozen=True)
-class Landscape:
+class Convergence:
     """Of one network, over starts of several samples; shares of 1."""
 
     home: float  # end within HOME
@@ -48,7 +48,7 @@ class Landscape:
     starts: int
 
 
-def landscape(
+def measure_convergence(
     model: PaperModel,
     config: PaperTraining,
     *,
@@ -57,7 +57,7 @@ def landscape(
     starts: int = 32,
     steps: int = 60,
     samples: SampleConfig | None = None,
-) -> Landscape:
+) -> Convergence:
     """Descends without noise from `starts` places about the right pose of each of `count` samples.
 
     The rotation network's object rests at the demonstrations' mean offset, as in its training.
@@ -102,7 +102,7 @@ def landscape(
             after.append((found_t - place).norm(dim=-1))
     start, end = torch.cat(before), torch.cat(after)
     unit = math.degrees(1) if part == "rotation" else 100.0
-    return Landscape(
+    return Convergence(
         home=float((end < HOME[part]).float().mean()),
         nearer=float((end < start).float().mean()),
         uphill=float(torch.cat(uphill).float().mean()),
@@ -131,7 +131,7 @@ def ablated(
 HEADER = f"{'run':<24} {'home':>6} {'nearer':>7} {'uphill':>7}  ends (median)  {'loss':>6}"
 
 
-def row(name: str, part: str, found: Landscape, loss: float | None) -> str:
+def row(name: str, part: str, found: Convergence, loss: float | None) -> str:
     """Of the table."""
     unit = "deg" if part == "rotation" else "cm"
     text = "" if loss is None else f"{loss:6.3f}"
@@ -181,7 +181,7 @@ def evaluate_stabilisers(arguments: argparse.Namespace) -> None:
         config = PaperTraining(
             **{k: v for k, v in card["training"].items() if k in ("frames", "subset")}
         )
-        found = landscape(net, config, count=arguments.count)
+        found = measure_convergence(net, config, count=arguments.count)
         loss = _last_loss(path.parent)
         results[name] = asdict(found) | {"loss": loss}
         if not arguments.json:

@@ -1,4 +1,4 @@
-"""How far a predicted end-effector pose is from the expert's, up to what makes no difference."""
+"""Errors of a predicted end-effector pose against the expert's, up to the objects' symmetries."""
 
 from collections.abc import Iterable, Mapping
 
@@ -6,7 +6,6 @@ import numpy as np
 from pydrake.math import RigidTransform
 from scipy.spatial.transform import Rotation
 
-from iga_drake.shapes.families import FAMILIES
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.symmetry import NO_SYMMETRY, Symmetry
 from iga_drake.tasks.snapshots import Snapshot
@@ -17,12 +16,11 @@ _HALVINGS = 24  # of the step between angles after that: to below 1e-8 rad
 
 
 def exact_symmetry(shape: ShapeInstance | None) -> Symmetry:
-    """The symmetry that a shape's family declares, none where it is not exact or unknown.
+    """The shape's symmetry if it is exact, else no symmetry.
 
-    None stands for an object without a shape, such as an empty hand.
+    `None` stands for an object without a shape, such as an empty hand: it has no symmetry.
     """
-    family = FAMILIES.get(shape.family) if shape is not None else None
-    return family.symmetry if family is not None and family.symmetry.exact else NO_SYMMETRY
+    return shape.symmetry if shape is not None and shape.symmetry.exact else NO_SYMMETRY
 
 
 def pose_error_at(

@@ -13,7 +13,7 @@ from iga_drake.evaluation.task_success import (
     evaluate,
     format_table,
     run_trial,
-    summarise,
+    summarise_trials,
     trial_key,
     wilson_interval,
 )
@@ -87,7 +87,7 @@ def test_results_of_other_conditions_are_not_taken_over(tmp_path: Path):
         run=run,
     )
     assert run.seeds == [0, 0]
-    assert [row["scenario"] for row in summarise(results)] == ["grasp", "b/grasp"]
+    assert [row["scenario"] for row in summarise_trials(results)] == ["grasp", "b/grasp"]
 
 
 def test_trials_are_known_by_scenario_demonstrations_and_options(tmp_path: Path):
@@ -107,7 +107,7 @@ def test_trials_are_known_by_scenario_demonstrations_and_options(tmp_path: Path)
 
 def test_summary_counts_and_names_causes():
     results = evaluate(make_trials(range(6)), run=FakeRun())
-    (row,) = summarise(results)
+    (row,) = summarise_trials(results)
     assert (row["successes"], row["trials"]) == (4, 6)
     assert row["failures"] == [
         {"seed": seed, "cause": "contact", "reason": "slipped"} for seed in (0, 1)

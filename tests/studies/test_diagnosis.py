@@ -26,7 +26,7 @@ from iga_drake.studies.diagnosis import (
     evaluate_diagnosis,
     hypothesis_errors,
     match_errors,
-    summarise,
+    summarise_diagnoses,
     true_logits,
 )
 
@@ -134,7 +134,7 @@ def test_shares_of_wrong_hypotheses() -> None:
 
 def test_the_summary_counts_energies_and_sorts_by_deformation() -> None:
     below, missed = (-2.0, -1.0, -2.1, -2.1), (-1.0, -2.0, -1.0, -2.5)
-    summary = summarise(
+    summary = summarise_diagnoses(
         [_row(0, 9.0, missed, 0.3), _row(1, 1.0, below, 0.1), _row(2, 5.0, below, 0.2)]
     )
     assert summary.below_truth == pytest.approx(2 / 3)

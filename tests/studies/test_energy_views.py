@@ -15,19 +15,19 @@ from iga_drake.errors import IgaDrakeError
 from iga_drake.geometry.se3 import transform
 from iga_drake.studies.energy_views import (
     REACH,
-    Scene,
+    ExplainedProblem,
     add_view_energy,
     landscape,
     match_lines,
-    show_scene,
+    show_explained,
     view_energy,
     write_figures,
 )
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    return Scene.of(IgaAligner(), "easy", 1, 2)
+def explained() -> ExplainedProblem:
+    return ExplainedProblem.of(IgaAligner(), "easy", 1, 2)
 
 
 def test_the_landscape_of_a_known_energy() -> None:
@@ -59,55 +59,55 @@ def test_the_landscape_of_a_known_energy() -> None:
     assert field.offsets[-1] == pytest.approx(REACH)
 
 
-def test_the_middle_of_the_landscape_is_the_solution(scene: Scene) -> None:
-    field = landscape(scene.explanation.energy, scene.best, scene.centre, steps=9)
-    energy = scene.explanation.estimate.energies[0]
+def test_the_middle_of_the_landscape_is_the_solution(explained: ExplainedProblem) -> None:
+    field = landscape(explained.explanation.energy, explained.best, explained.centre, steps=9)
+    energy = explained.explanation.estimate.energies[0]
     assert field.plane[4, 4] == pytest.approx(energy)
     assert field.screw[4, 8] == pytest.approx(energy)
     np.testing.assert_allclose(field.curves[:, 8], energy, rtol=1e-5)
     assert field.plane.max() > energy + 1
 
 
-def test_lines_join_nodes_of_both_clouds_and_known_matches(scene: Scene) -> None:
+def test_lines_join_nodes_of_both_clouds_and_known_matches(explained: ExplainedProblem) -> None:
     """With an assignment of node k to node 3 k."""
-    matches = scene.explanation.matches
+    matches = explained.explanation.matches
     sure = torch.zeros_like(matches[0][1].assignment)
     sure[:, torch.arange(10), 3 * torch.arange(10)] = 0.7
     known = replace(
-        scene.explanation,
+        explained.explanation,
         matches=([matches[0][0], replace(matches[0][1], assignment=sure)], matches[1]),
     )
     lines = match_lines(known, 0, 1, count=10)
-    nodes = scene.explanation.nodes[0].numpy()
+    nodes = explained.explanation.nodes[0].numpy()
     np.testing.assert_array_equal(lines.test, nodes[-1, :10])
     np.testing.assert_array_equal(lines.demonstration, nodes[1, :30:3])
     np.testing.assert_allclose(lines.confidence, 0.7)
     np.testing.assert_allclose(lines.R_TD @ lines.R_TD.T, np.eye(3), atol=1e-9)
 
 
-def test_the_truth_of_a_solved_problem_is_near_the_best_mode(scene: Scene) -> None:
-    shift, angle = scene.problem.error(scene.truth)
+def test_the_truth_of_a_solved_problem_is_near_the_best_mode(explained: ExplainedProblem) -> None:
+    shift, angle = explained.problem.error(explained.truth)
     assert shift < 1e-6 and angle < 1e-6
-    assert "mode 0: energy" in scene.text() and "2 demonstrations" in scene.text()
+    assert "mode 0: energy" in explained.text() and "2 demonstrations" in explained.text()
 
 
-def test_figures_are_written_and_not_empty(scene: Scene, tmp_path: Path) -> None:
-    field = landscape(scene.explanation.energy, scene.best, scene.centre, steps=9)
-    paths = write_figures(scene, field, tmp_path / "new")
+def test_figures_are_written_and_not_empty(explained: ExplainedProblem, tmp_path: Path) -> None:
+    field = landscape(explained.explanation.energy, explained.best, explained.centre, steps=9)
+    paths = write_figures(explained, field, tmp_path / "new")
     assert len(paths) == 3
     for path in paths:
         image = imread(path)
         assert image.shape[0] > 300 and image.std() > 0.02
 
 
-def test_meshcat_gets_modes_matches_parts_and_demonstrations(scene: Scene) -> None:
+def test_meshcat_gets_modes_matches_parts_and_demonstrations(explained: ExplainedProblem) -> None:
     from iga_drake.viewing.replay import quiet_meshcat
 
     meshcat = quiet_meshcat()
-    field = landscape(scene.explanation.energy, scene.best, scene.centre, steps=5)
-    show_scene(meshcat, scene, field)
-    probability = scene.explanation.estimate.probabilities[0]
-    energy = scene.explanation.estimate.energies[0]
+    field = landscape(explained.explanation.energy, explained.best, explained.centre, steps=5)
+    show_explained(meshcat, explained, field)
+    probability = explained.explanation.estimate.probabilities[0]
+    energy = explained.explanation.estimate.energies[0]
     paths = [
         f"modes/0 energy {energy:.2f} probability {probability:.2f}",
         "test/target cloud", "truth", "landscape", "parts/A", "parts/B", "matches/0 A",

@@ -24,7 +24,7 @@ from iga_drake.studies.scaling import (
     evaluate_diversity,
     evaluate_scaling,
     growth,
-    measure,
+    measure_costs,
     peak_memory,
 )
 
@@ -71,7 +71,7 @@ def test_counts_of_nodes_and_pairs() -> None:
 
 
 def test_costs_rise_with_the_demonstrations() -> None:
-    one, many = measure(small_aligner(), [1, 8], 1, split="diversity_low", memory_samples=1)
+    one, many = measure_costs(small_aligner(), [1, 8], 1, split="diversity_low", memory_samples=1)
     assert many.nodes == 4.5 * one.nodes and many.across == 36 * one.across
     assert many.memory > one.memory > 2 * 128 * 24 * 8
     assert many.total > 0 and 0 < many.seconds["across"] < many.seconds["describe"]

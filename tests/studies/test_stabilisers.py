@@ -13,7 +13,7 @@ from iga_drake.aligners.iga_paper.graph import GraphConfig
 from iga_drake.dataset.samples import SampleConfig
 from iga_drake.errors import IgaDrakeError
 from iga_drake.studies import stabilisers
-from iga_drake.studies.stabilisers import ABLATIONS, ablated, landscape
+from iga_drake.studies.stabilisers import ABLATIONS, ablated, measure_convergence
 from iga_drake.training.paper import PaperTraining, right_place
 
 SAMPLES = SampleConfig(cloud_points=64, surface_points=400, least_seen=8)
@@ -38,7 +38,7 @@ def test_a_well_brings_home_and_a_hill_does_not(part: str, sign: int, monkeypatc
 
     monkeypatch.setattr(stabilisers, "right_place", remember)
     monkeypatch.setattr(stabilisers, "energy_of", energy)
-    found = landscape(model(part), PaperTraining(), count=2, starts=5, samples=SAMPLES)
+    found = measure_convergence(model(part), PaperTraining(), count=2, starts=5, samples=SAMPLES)
     assert found.starts == 10
     assert (found.home, found.nearer, found.uphill) == ((1, 1, 0) if sign == 1 else (0, 0, 1))
     assert found.final_median < 1 if sign == 1 else found.final_median > 5

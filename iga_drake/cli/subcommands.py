@@ -10,7 +10,7 @@ from iga_drake.cli.status import SUCCESS
 
 
 @dataclass(frozen=True)
-class Part:
+class Subcommand:
     """Where a part of a command lives."""
 
     module: str
@@ -19,13 +19,15 @@ class Part:
     run: str = "run"
 
 
-def add_parts(parser: argparse.ArgumentParser, parts: Mapping[str, Part]) -> None:
+def add_subcommands(parser: argparse.ArgumentParser, parts: Mapping[str, Subcommand]) -> None:
     """The part's name and, left as they are, its own options."""
     parser.add_argument("what", choices=parts)
     parser.add_argument("options", nargs=argparse.REMAINDER, help="see `... WHAT --help`")
 
 
-def run_part(command: str, parts: Mapping[str, Part], arguments: argparse.Namespace) -> int:
+def run_subcommand(
+    command: str, parts: Mapping[str, Subcommand], arguments: argparse.Namespace
+) -> int:
     """Runs `iga command what` with options of its own."""
     part = parts[arguments.what]
     module = importlib.import_module(part.module)
