@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-# What the temporary names end in.
+# Suffix of temporary files.
 PARTIAL = ".partial"
 
 

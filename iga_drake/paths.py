@@ -1,4 +1,4 @@
-"""Where the repository's data folders lie, in an installed wheel and in a checkout."""
+"""Paths of the repository's data folders, in an installed wheel and in a checkout."""
 
 import os
 from pathlib import Path

@@ -54,7 +54,7 @@ class Registry(Generic[T]):
             raise self.error(f"unknown {self.kind} '{name}': one of: {', '.join(names)}")
 
     def factory(self, name: str) -> Callable[..., T]:
-        """What makes the thing called `name`. Raises `error` where it is unknown or broken."""
+        """The factory called `name`. Raises `error` if it is unknown or does not load."""
         self.check(name)
         found = self._found()[name]
         if not isinstance(found, EntryPoint):

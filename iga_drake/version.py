@@ -1,4 +1,4 @@
-"""Which code made a result or a demonstration."""
+"""The version of the code, as results and demonstrations record it."""
 
 import functools
 import hashlib

@@ -71,5 +71,5 @@ class Aligner(Protocol):
 
 
 def weights_digest(aligner: Aligner) -> str:
-    """What tells the aligner's weights from others; empty where it has none."""
+    """Digest that identifies the aligner's weights; empty if it has none."""
     return str(getattr(aligner, "weights_digest", ""))

@@ -1,4 +1,4 @@
-"""`iga benchmark`: times of parts."""
+"""`iga benchmark`: measures how long parts of the system take."""
 
 import argparse
 
@@ -11,10 +11,10 @@ SUBCOMMANDS = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """What is timed; the rest are its own options."""
+    """Adds the benchmark's name; the options after it are the benchmark's own."""
     add_subcommands(parser, SUBCOMMANDS)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Times it."""
+    """Runs the benchmark; returns the exit status."""
     return run_subcommand("benchmark", SUBCOMMANDS, arguments)

@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _count(arguments: argparse.Namespace) -> int:
-    """How many samples are meant; checks the set's name and size."""
+    """The number of samples asked for; checks the set's name and size."""
     from iga_drake.dataset.splits import sample_set
 
     size = sample_set(arguments.split).count

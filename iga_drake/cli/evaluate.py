@@ -30,10 +30,10 @@ SUBCOMMANDS = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """What is evaluated; the rest are its own options."""
+    """Adds the evaluation's name; the options after it are the evaluation's own."""
     add_subcommands(parser, SUBCOMMANDS)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Evaluates it."""
+    """Runs the evaluation; returns the exit status."""
     return run_subcommand("evaluate", SUBCOMMANDS, arguments)

@@ -53,7 +53,10 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _trials(arguments: argparse.Namespace) -> "list[Trial]":
-    """Of every scenario with every aligner; all that was asked for is checked."""
+    """The trials of every scenario with every aligner.
+
+    Raises `IgaDrakeError` for an unknown scenario, aligner or option, before any trial runs.
+    """
     from iga_drake.evaluation.task_success import Trial, trial_key
     from iga_drake.station.scenario import scenario_path
 

@@ -23,7 +23,7 @@ def names(text: str) -> list[str]:
 
 
 def add_aligner_options(parser: argparse.ArgumentParser) -> None:
-    """`--option`, which `aligner_options` reads."""
+    """Adds `--option`, which `aligner_options` reads."""
     parser.add_argument(
         "--option", dest="aligner_options", action="append", default=[],
         metavar="[ALIGNER.]NAME=VALUE",

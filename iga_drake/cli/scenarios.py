@@ -12,13 +12,13 @@ if TYPE_CHECKING:
 
 
 def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
-    """A scenario, files laid over it, and single values set in it."""
+    """Adds the scenario, and the options of `add_overlay_arguments`."""
     parser.add_argument("scenario", help="scenario YAML, e.g. diagrams/stack.yaml, or its name")
     add_overlay_arguments(parser)
 
 
 def add_overlay_arguments(parser: argparse.ArgumentParser) -> None:
-    """What is changed in a scenario: further files, then single values."""
+    """Adds `--with` and `--set`: files and single values that change a scenario."""
     parser.add_argument(
         "--with", dest="overlays", action="append", default=[], metavar="FILE",
         help="further scenario file whose keys replace the scenario's; may be repeated",

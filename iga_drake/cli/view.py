@@ -19,10 +19,10 @@ SUBCOMMANDS = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """What is looked at; the rest are its own options."""
+    """Adds the view's name; the options after it are the view's own."""
     add_subcommands(parser, SUBCOMMANDS)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Shows it."""
+    """Shows the view; returns the exit status."""
     return run_subcommand("view", SUBCOMMANDS, arguments)

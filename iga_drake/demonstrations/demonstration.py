@@ -238,15 +238,17 @@ class DemonstrationSet:
 
     @cached_property
     def contexts(self) -> tuple[tuple[Alignment, ...], ...]:
-        """What an aligner sees of the demonstrations: one alignment a demonstration, for each
-        waypoint."""
+        """The aligner's context for each waypoint: one alignment a demonstration."""
         return tuple(
             tuple(demonstration.alignment(t) for demonstration in self.demonstrations)
             for t in range(len(self.waypoints))
         )
 
     def context(self, waypoint: int) -> tuple[Alignment, ...]:
-        """What an aligner sees of the demonstrations for one waypoint."""
+        """The aligner's context for one waypoint: one alignment a demonstration.
+
+        Raises `DemonstrationError` for an index out of range.
+        """
         if not 0 <= waypoint < len(self.waypoints):
             raise DemonstrationError(
                 f"task '{self.task}': waypoint {waypoint} asked for, 0 to "

@@ -41,13 +41,13 @@ THRESHOLDS = ((0.01, 5.0), (0.02, 10.0), (0.03, 15.0))  # m, deg
 
 @dataclass(frozen=True)
 class SampleErrors:
-    """Errors of one sample; m and rad. `None` where the oracle has no answer."""
+    """Errors (m, rad) of one aligner on one sample."""
 
     aligner: str
     split: str
     index: int
-    grasped: str  # category
-    target: str
+    grasped: str  # the grasped object's category
+    target: str  # the target's category
     translation: float
     rotation: float
     translation_modulo: float  # modulo symmetry
@@ -58,7 +58,7 @@ class SampleErrors:
 
 @dataclass(frozen=True)
 class Errors:
-    """Over many samples; cm and degrees."""
+    """Statistics of alignment errors over many samples, in cm and degrees."""
 
     translation_mean: float
     translation_std: float
@@ -70,7 +70,7 @@ class Errors:
 
     @staticmethod
     def of(translation: np.ndarray, rotation: np.ndarray) -> "Errors":
-        """translation (n,) m, rotation (n,) rad."""
+        """The statistics of n errors: `translation` (n,) m, `rotation` (n,) rad."""
         cm, deg = 100 * translation, np.degrees(rotation)
         return Errors(
             float(cm.mean()),
@@ -83,7 +83,7 @@ class Errors:
         )
 
     def columns(self) -> str:
-        """Part of a row of the table."""
+        """The statistics as the text columns of one table line."""
         rates = "  ".join(f"{100 * rate:5.1f}" for rate in self.success)
         return (
             f"{self.translation_mean:5.2f} ± {self.translation_std:5.2f} "
@@ -106,7 +106,7 @@ class AlignmentErrors:
     reused: int  # how many of the errors were found in a results file
 
     def rows(self) -> str:
-        """Two lines of the table."""
+        """Two lines of the table under `HEADER`: plain, and modulo symmetry."""
         first = f"{self.aligner:<8} {self.split:<18} {self.count:>5}"
         reused = f"  {self.reused} reused" if self.reused else ""
         return (
@@ -122,7 +122,10 @@ HEADER = (
 
 
 def evaluate_sample(aligner: Aligner | None, split: str, index: int) -> SampleErrors | None:
-    """Aligns one sample; without an aligner the oracle answers, or not (None)."""
+    """The errors of an aligner on sample `index` of a set.
+
+    Without an aligner the oracle answers; None if it has no answer.
+    """
     sample = make_sample(split, index, CONFIG)
     test = sample.points[0, -1]
     began = time.perf_counter()
@@ -196,7 +199,7 @@ def evaluate_alignment(
 
 
 def summarise_errors(rows: Iterable[SampleErrors]) -> AlignmentErrors:
-    """Means over rows of one aligner and one set."""
+    """Error statistics over the samples of one aligner and one set."""
     rows = list(rows)
     table = np.array(
         [(r.translation, r.rotation, r.translation_modulo, r.rotation_modulo) for r in rows]

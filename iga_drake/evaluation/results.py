@@ -94,12 +94,15 @@ def text_digest(text: str) -> str:
 
 
 def config_digest(config: Any) -> str:
-    """Of a dataclass of plain values."""
+    """Digest (see `text_digest`) of the field values of a dataclass `config`."""
     return text_digest(json.dumps(dataclasses.asdict(config), sort_keys=True, default=str))
 
 
 def folder_digest(folder: Path) -> str:
-    """Of the names and bytes of all files in a folder; empty where there is no such folder."""
+    """Digest (16 hexadecimal digits) of the names and bytes of all files in a folder.
+
+    Empty text if there is no such folder.
+    """
     if not folder.is_dir():
         return ""
     return _files_digest(folder, sorted(p for p in folder.rglob("*") if p.is_file()))

@@ -41,13 +41,13 @@ class Trial:
 
     @property
     def whole_key(self) -> dict[str, Any]:
-        """What the result is stored by."""
+        """The key under which a `ResultsStore` keeps the result: `key`, split and seed."""
         return {**self.key, "split": self.split, "seed": self.seed}
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrialResult:
-    """What became of a trial."""
+    """The outcome of one trial: success or cause of failure, errors and times."""
 
     task: str
     scenario: str  # what it is called in tables
@@ -68,9 +68,10 @@ class TrialResult:
 
 
 def trial_key(scenario: Scenario) -> dict[str, Any]:
-    """What trials of a scenario depend on besides seed and split. The aligner's weights are read.
+    """A results key that changes with everything a trial depends on besides seed and split:
+    scenario, demonstrations, aligner, code.
 
-    Raises `AlignerError`.
+    Loads the aligner to learn its weights' digest. Raises `AlignerError` if that fails.
     """
     name, options = scenario.aligner.name, scenario.aligner.options
     aligner = None if name == EXPERT else make_aligner(name, **options)
@@ -131,7 +132,7 @@ _MEASURED = (
 
 
 def _result(trial: Trial, row: Mapping[str, Any], *, reused: bool = False) -> TrialResult:
-    """What a row says of a trial; other values of the row are left out."""
+    """The trial's result from a stored or reported row; unknown values in the row are ignored."""
     return TrialResult(
         scenario=trial.scenario, aligner=trial.aligner, seed=trial.seed, split=trial.split,
         reused=reused, **{name: row[name] for name in _MEASURED if name in row},

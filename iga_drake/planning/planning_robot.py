@@ -44,7 +44,7 @@ class PlanningRobot:
     safety_distance: float
     # The end-effector frame E, welded to the arm's last link.
     frame_E: Frame
-    # Which of the plant's positions the arm moves; the others (the hand's) stay.
+    # Mask of the plant's positions that are the arm's joints; the others (the hand's) stay fixed.
     active: DofMask
     # All positions of the plant, the active ones in a comfortable posture.
     position_default: np.ndarray

@@ -42,18 +42,18 @@ def interpolate_pose(X_WA: RigidTransform, X_WB: RigidTransform, share: float) -
 
 
 class Path(Protocol):
-    """A way of the end effector with a parameter from 0 to 1."""
+    """An end-effector path X_WE(share), with `share` of the way from 0 to 1."""
 
     def pose(self, share: float) -> RigidTransform:
         """X_WE at `share` of the way."""
         ...
 
     def posture(self, share: float) -> np.ndarray | None:
-        """Nominal posture (rad) at `share` of the way, None if it is left as it is."""
+        """Nominal joint angles (7,) (rad) at `share` of the way; None keeps the present ones."""
         ...
 
     def duration(self, linear_speed: float, angular_speed: float) -> float:
-        """Time (s) that it takes at these speeds (m/s, rad/s) of the end effector."""
+        """Time (s) to travel the path at these end-effector speeds (m/s, rad/s)."""
         ...
 
 

@@ -92,7 +92,7 @@ class IgaPolicy(LeafSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(machine.config.period, 0.0, self._update)
 
     def memory(self, context: Context) -> PolicyMemory:
-        """What the policy remembers in its own `context`."""
+        """The policy's whole state, read from its own `context`."""
         abstract: Any = context.get_abstract_state(int(self._memory_index))
         return abstract.get_value()
 

@@ -62,7 +62,7 @@ class PolicyConfig:
     present_limit: float = 20.0
     # Limit (s) of the motion around each waypoint.
     move_limit: float = 60.0
-    # What happens while the aligner works. "lockstep": simulated time waits, so that runs can be
+    # How the loop runs while the aligner works. "lockstep": simulated time waits, so that runs can be
     # repeated exactly. "delay": the answer arrives `infer_delay` after the question, in simulated
     # time. "concurrent": the loop runs on and the arm holds until the answer is there.
     inference: str = "lockstep"
@@ -90,10 +90,10 @@ class PolicyConfig:
 
 
 class PolicyInputs(Protocol):
-    """What the machine may ask for in one tick; each call pulls one input port."""
+    """Inputs of one tick; each call evaluates one input port, so ask only when it is needed."""
 
     def cloud(self, role: ObservedRole) -> np.ndarray:
-        """(P, 3) m in W, what the cameras see of the objects with this role."""
+        """The fused camera cloud (P, 3) (m, in W) of the objects with this role."""
         ...
 
     def silent_cameras(self) -> Mapping[str, str]:
@@ -101,37 +101,47 @@ class PolicyInputs(Protocol):
         ...
 
     def pose(self) -> RigidTransform:
-        """Measured X_WE."""
+        """The measured end-effector pose X_WE."""
         ...
 
     def position(self) -> np.ndarray:
-        """(7,) rad, measured."""
+        """The measured joint angles (7,) (rad)."""
         ...
 
-    def follower(self) -> FollowerStatus: ...
+    def follower(self) -> FollowerStatus:
+        """The waypoint follower's status."""
+        ...
 
-    def supervisor(self) -> SupervisorStatus: ...
+    def supervisor(self) -> SupervisorStatus:
+        """The supervisor's status; not holding if no supervisor is connected."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyMemory:
-    """All that the policy remembers; never changed in place."""
+    """The policy's whole state: immutable, replaced at every tick."""
 
     status: PolicyStatus
+    # Simulated time at which the present phase began (s).
     phase_started: float
+    # Target that the follower is sent now.
     target: EndEffectorTarget
+    # Simulated time of the next attempt to observe (s).
     observe_next: float = 0.0
-    # Name of the plan -> what was observed.
+    # Observed clouds by the names of their `ObservationPlan`s.
     observations: Mapping[str, Observation] = field(default_factory=lambda: MappingProxyType({}))
-    # Of each waypoint, as far as it was inferred.
+    # The aligner's estimate of each waypoint inferred so far.
     estimates: tuple[PoseEstimate, ...] = ()
+    # The pose chosen from each estimate.
     chosen: tuple[ReachablePose, ...] = ()
-    # The inference under way, and the wall-clock time at which it began (s).
+    # Number of the inference under way, None if there is none.
     question: int | None = None
+    # Wall-clock time at which it began (s).
     asked: float = 0.0
+    # Steps of the motion under way, and the index of the present one.
     steps: tuple[MotionStep, ...] = ()
     step: int = 0
-    # Number of waypoints that are behind.
+    # Number of waypoints followed so far.
     followed: int = 0
 
     def __deepcopy__(self, memo: dict) -> "PolicyMemory":
@@ -200,7 +210,7 @@ class PolicyMachine:
         )
 
     def advance(self, memory: PolicyMemory, inputs: PolicyInputs, now: float) -> PolicyMemory:
-        """One tick at time `now` (s)."""
+        """The memory after one tick at simulated time `now` (s)."""
         phase = memory.status.phase
         if phase.final:
             return memory
@@ -222,7 +232,7 @@ class PolicyMachine:
     # What comes next
 
     def _unseen(self, seen: Mapping[str, Observation], followed: int) -> ObservationPlan | None:
-        """The first cloud that the cameras have to see now."""
+        """The first plan that is due and still to be observed by the cameras; None if there is none."""
         for plan in self.motion.observations:
             if plan.role != "gripper" and plan.name not in seen and plan.after <= followed:
                 return plan
@@ -231,7 +241,7 @@ class PolicyMachine:
     def _continue(
         self, memory: PolicyMemory, inputs: PolicyInputs, now: float, detail: str = ""
     ) -> PolicyMemory:
-        """Enters the phase that follows when one is over."""
+        """Enters the next phase after one is over: observe, present, infer, move or done."""
         if memory.followed == len(self.motion.waypoints):
             return self._enter(memory, Phase.DONE, now, detail=detail)
         plan = self._unseen(memory.observations, memory.followed)
@@ -445,7 +455,7 @@ class PolicyMachine:
         return replace(memory, status=status, phase_started=now)
 
     def _refuse(self, memory: PolicyMemory, now: float, reason: str, cause: Cause) -> PolicyMemory:
-        """Nothing is under way: the arm rests at its last target."""
+        """Ends in `Phase.REFUSED`: no motion is under way, so the arm rests at its last target."""
         during = f"{memory.status.phase.value} {memory.status.subject}".strip()
         memory = self._enter(memory, Phase.REFUSED, now, detail=reason)
         status = replace(memory.status, reason=f"{during}: {reason}", cause=cause)
@@ -454,7 +464,8 @@ class PolicyMachine:
     def _fail(
         self, memory: PolicyMemory, inputs: PolicyInputs, now: float, reason: str, cause: Cause
     ) -> PolicyMemory:
-        """A motion may be under way: the arm is held where it is, the hand as it is."""
+        """Ends in `Phase.FAILED`: a motion may be under way, so the arm is held at its measured pose
+        and the hand keeps its opening."""
         status = memory.status
         during = status.step or f"{status.phase.value} {status.subject}".strip()
         opening = memory.target.opening_moving

@@ -1,4 +1,4 @@
-"""What a task observes and how it moves around its waypoints; phases and choices of the policy.
+"""Description of a task's observations and motions; phases, status and pose choice of the policy.
 
 Everything here is a plain function or a frozen value, so that it can be tested without a diagram.
 """
@@ -25,7 +25,7 @@ class Refusal(IgaDrakeError):
 
 
 class Phase(Enum):
-    """Where the policy is; the last three are final. The others may come several times."""
+    """The policy's phases. The last three are final; the others may be entered several times."""
 
     OBSERVE = "observe"
     PRESENT = "present"
@@ -49,7 +49,7 @@ class PhaseEntry:
     phase: Phase
     # Name of the observation or the waypoint that the phase is about.
     subject: str = ""
-    # What is known when the phase begins, in words.
+    # Result of the phase before, in words (which mode was chosen, say).
     detail: str = ""
 
     def __str__(self) -> str:
@@ -59,20 +59,20 @@ class PhaseEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyStatus:
-    """What the policy reports about itself."""
+    """The policy's report: phase, timeline, failure reason and progress."""
 
     phase: Phase
     # Every phase entered so far, oldest first.
     timeline: tuple[PhaseEntry, ...]
     # Why the policy refused or failed; empty otherwise.
     reason: str = ""
-    # Kind of that reason.
+    # Kind of the refusal or failure; None otherwise.
     cause: Cause | None = None
-    # Name of the motion step under way.
+    # Name of the motion step under way; empty while nothing moves.
     step: str = ""
     # Measured X_WE at each waypoint reached so far, before the hand acted there.
     waypoints_reached: tuple[RigidTransform, ...] = ()
-    # Simulated time (s) at which each of them was reached.
+    # Simulated time (s) at which each of these waypoints was reached.
     times_reached: tuple[float, ...] = ()
     # Wall-clock time of each inference so far (s).
     inference_seconds: tuple[float, ...] = ()
@@ -87,9 +87,9 @@ class PolicyStatus:
 class ObservationPlan:
     """One cloud that a task needs, and when and how it is seen."""
 
-    # The name by which waypoints, here and in demonstrations, relate it.
+    # Name by which waypoints, here and in demonstrations, refer to the cloud.
     name: str
-    # Which of the fused clouds it is; "gripper": the points of the hand's own model.
+    # Source of the cloud: a fused cloud, or "gripper" for the points of the hand's own model.
     role: ObservedRole
     # Frame in which it is kept: "E" for what moves with the hand, "W" for what stands still.
     frame: Frame
@@ -107,7 +107,7 @@ class WaypointMotion:
 
     # The waypoint's name in the demonstrations.
     name: str
-    # Names of the observations that it relates.
+    # Names of the two observations whose relative pose the waypoint sets.
     grasped: str
     target: str
     # Offset (m) of the pose before the waypoint: along the axes of E there, plus along those of W.
@@ -198,7 +198,8 @@ def motion_steps(
     opening_reached: float,
     nominal_posture: np.ndarray | None = None,
 ) -> tuple[MotionStep, ...]:
-    """Before, at, act, after: the targets around one inferred waypoint `X_WE`."""
+    """The four targets around one inferred waypoint `X_WE`: before it, at it, the hand's action
+    there, and after it. Their sequence numbers rise from `first_sequence`."""
     before = offset_pose(X_WE, motion.before_E, motion.before_W)
     after = offset_pose(X_WE, motion.after_E, motion.after_W)
     approach = motion.opening_approach

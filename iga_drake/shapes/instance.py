@@ -127,7 +127,7 @@ class ShapeInstance:
         self._require(self.mesh.volume > 0, "the faces look inwards (negative volume)")
 
     def with_mass(self, mass: float) -> "ShapeInstance":
-        """The same shape with the density that gives it `mass` (kg)."""
+        """A copy of the shape with the density that gives it `mass` (kg)."""
         scale = mass / self.mass_properties.mass
         return dataclasses.replace(self, density=self.density * scale)
 

@@ -72,7 +72,7 @@ class Table:
 class Panda:
     """The robot in simulation."""
 
-    # What is drawn: "primitives" (simple shapes), "meshes" (the published meshes, needs the extra
+    # Visual geometry: "primitives" (simple shapes), "meshes" (the published meshes, needs the extra
     # `visuals`), or "auto": primitives for the cameras, so that perception is the same on every
     # machine, and meshes for viewers where they can be had. Collisions are the same in all.
     visuals: str = "auto"
@@ -98,7 +98,7 @@ def _cameras() -> dict[str, RgbdCamera]:
 
 @dataclass
 class TaskChoice:
-    """Which task is done."""
+    """The task to do, by name, and its time limit."""
 
     # Name in the task registry of `iga_drake.tasks`.
     name: str = "grasp"
@@ -108,19 +108,18 @@ class TaskChoice:
 
 @dataclass
 class AlignerChoice:
-    """Which alignment method predicts the waypoints."""
+    """The aligner that predicts the waypoints, by name, and its options."""
 
     # Name in the aligner registry of `iga_drake.aligners`.
     name: str = "iga"
-    # What that aligner lets one choose, as numbers or text; it refuses names it doesn't know.
+    # The aligner's options by name; it raises `AlignerError` for a name it doesn't know.
     options: dict[str, float | str] = field(default_factory=dict)
 
 
 @dataclass
 class Seeds:
-    """Added to the episode's seed, so that one source of chance varies and the others stay.
-
-    Each >= 0.
+    """Offsets, each >= 0, added to the episode's seed for one source of chance each, so that one
+    varies while the others stay.
     """
 
     # Objects and their poses.
@@ -154,7 +153,7 @@ class Scenario:
     aligner: AlignerChoice = field(default_factory=AlignerChoice)
     # Folder with the demonstrations; a relative path starts at `models/`.
     demonstrations: str = "demonstrations/grasp"
-    # How many of them, from the first on, make up the aligner's context; all where there are fewer.
+    # The first so many demonstrations make up the aligner's context; all if there are fewer.
     context_size: int = 3
     visualization: Visualization = field(default_factory=Visualization)
     seeds: Seeds = field(default_factory=Seeds)
@@ -166,7 +165,7 @@ class Scenario:
 
     @property
     def digest(self) -> str:
-        """The same for scenarios that say the same, whatever their files are called."""
+        """First 16 hexadecimal digits of the SHA-256 of `to_yaml()`; file names don't matter."""
         return hashlib.sha256(self.to_yaml().encode()).hexdigest()[:16]
 
     def to_yaml(self) -> str:
@@ -226,7 +225,11 @@ def scenario_path(name: str | Path) -> Path:
 
 
 def _override_text(override: str, scenario: Scenario) -> str:
-    """The setting "a.b=c" as YAML; what is one of several types in the scenario stays that type."""
+    """The YAML text `{a: {b: c}}` of a setting "a.b=c".
+
+    A value whose field takes several types keeps the type that it has in `scenario`. Raises
+    `ScenarioError` where the setting is not of this form.
+    """
     key, found, value = override.partition("=")
     names = key.strip().split(".")
     if not found or not all(names):

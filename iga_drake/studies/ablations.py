@@ -62,9 +62,9 @@ class AblationError(IgaDrakeError):
 
 @dataclass(frozen=True)
 class Setup:
-    """All that a variant may change."""
+    """Settings of training and inference that variants may change."""
 
-    # What poses come from: the "vote" alone, "both" (the energy ranks and refines what it and the
+    # Source of the poses: the "vote" alone, "both" (the energy ranks and refines what it and the
     # vote propose), or the "energy" alone.
     search: str = "vote"
     aligner: IgaConfig = field(default_factory=IgaConfig)
@@ -73,8 +73,8 @@ class Setup:
     energy_training: EnergyTraining = field(
         default_factory=lambda: EnergyTraining(problems=450, modes_problems=150, foreign_problems=0)
     )
-    # What descriptors start from: "random" weights, the "occupancy" encoder's; or they stay
-    # "untrained".
+    # Initial weights of the descriptors: "random", or the "occupancy" encoder's; "untrained" ones
+    # are random and stay so.
     start: str = "random"
     descriptor: DescriptorConfig = field(default_factory=DescriptorConfig)
     descriptor_training: DescriptorTraining = field(
@@ -83,7 +83,7 @@ class Setup:
     samples: SampleConfig = field(default_factory=SampleConfig)
 
     def changed(self, changes: Mapping[str, Any]) -> "Setup":
-        """With fields, or fields of fields, replaced."""
+        """A copy with fields replaced; a dict as value replaces fields of that field."""
         new = {
             name: dataclasses.replace(getattr(self, name), **value)
             if isinstance(value, dict)
@@ -95,7 +95,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Variant:
-    """One thing done otherwise."""
+    """The default setup with one change."""
 
     name: str
     group: str
@@ -178,12 +178,12 @@ VARIANTS = (
 
 @dataclass(frozen=True)
 class Row:
-    """What was measured of a variant."""
+    """Measurements of one variant: a row of the table."""
 
     name: str
     group: str
     change: str
-    conditions: dict[str, Any]  # that rows of one table have in common
+    conditions: dict[str, Any]  # equal in all rows of one table
     samples_seen: int
     seconds: float  # of training
     parameters: int  # trained
@@ -192,7 +192,7 @@ class Row:
     reused: bool = field(default=False, compare=False)  # found in the folder's results
 
     def text(self) -> str:
-        """Of the table."""
+        """One line of the table under `HEADER`."""
         columns = [
             f"{self.errors[name]:6.2f} ({self.errors[f'{name}_median']:6.2f})"
             for name in ("displacement_cm", "translation_cm", "rotation_deg")
@@ -221,7 +221,7 @@ class EnergyAlone:
     name = "energy"
 
     def __init__(self, aligner: IgaAligner, energy: PairEnergyNet):
-        """Matches as `aligner` does."""
+        """`aligner` gives the matches; `energy` ranks and refines the poses."""
         self._aligner = aligner
         self._energy = energy.double()
 
@@ -273,8 +273,8 @@ class Ablations:
 
     folder: Path
     setup: Setup = field(default_factory=Setup)
-    steps: int | None = None  # of each training
-    # or so many as the group's default makes in this time
+    steps: int | None = None  # of each training; None: as many as fit in `minutes_each`
+    # Time for the training of a group's default, which sets the steps of the whole group (min).
     minutes_each: float = 10.0
     count: int = 100  # samples (or problems) that errors are measured on
     weights: Path = field(default_factory=default_weights)
@@ -307,7 +307,7 @@ class Ablations:
             yield row
 
     def measured(self, group: str) -> str:
-        """What the rows of a group are about."""
+        """A caption for the rows of a group: weights, error set and number of samples."""
         return {
             INFERENCE: f"landed weights; errors over {self.count} samples of {ENERGY_SET}",
             ENERGIES: f"errors over {self.count} problems of {ENERGY_SET}",
@@ -315,7 +315,7 @@ class Ablations:
         }[group]
 
     def _check(self, variants: Sequence[Variant]) -> None:
-        """Before minutes of computation."""
+        """Raises `AblationError` for bad options or missing files, before any long computation."""
         if self.count < 1:
             raise AblationError(f"--count {self.count}: at least 1 sample is needed")
         if self.steps is not None and self.steps < 1:
@@ -430,7 +430,11 @@ class Ablations:
         return path
 
     def _steps(self, group: str) -> int:
-        """Of each training of a group; for a time they are measured once, and written down."""
+        """Number of steps of each training of a group.
+
+        Unless it is given, the number that fits in `minutes_each` is measured once and kept in the
+        folder's steps.json.
+        """
         if self.steps is not None:
             return self.steps
         path = self.folder / "steps.json"

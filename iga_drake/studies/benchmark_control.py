@@ -58,7 +58,7 @@ class Gaps:
     median: float
     percentile_999: float
     longest: float
-    # The same, with the tick that takes the answer and looks for a reachable pose.
+    # Longest gap if the tick that takes the answer and looks for a reachable pose counts too.
     longest_with_answer: float
 
 

@@ -30,7 +30,7 @@ _CONTROL = WaypointFollowerConfig(period=0.005, linear_speed=0.25, angular_speed
 
 @dataclass(frozen=True)
 class IkBenchmark:
-    """What was seen on the way to all the poses. A limit is broken if its count isn't zero."""
+    """Totals over the motions to all poses. A limit was broken if its count isn't zero."""
 
     count: int
     reached: int

@@ -40,7 +40,7 @@ def random_problem(
 
 
 def batched(pair: tuple[Nodes, Nodes]) -> tuple[Nodes, Nodes]:
-    """As a batch of one problem."""
+    """Both objects' nodes with a leading batch axis of length 1."""
     a, b = (Nodes(*(part[None] for part in nodes)) for nodes in pair)
     return a, b
 

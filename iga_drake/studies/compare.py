@@ -60,17 +60,17 @@ COMPARED = ("iga", *PARTS)
 
 @dataclass(frozen=True)
 class Trained:
-    """An aligner, and what its training took."""
+    """A trained aligner with the cost of its training."""
 
     name: str
     weights: str  # where they were read
     aligner: Aligner
     samples_seen: int  # by each of its networks
-    # Of the whole training, matrix products forward and backward; what came before the last leg of
-    # a training at that leg's operations for each sample.
+    # Floating point operations of the whole training: matrix products, forward and backward. Legs
+    # before the last are counted at the last one's operations per sample.
     flops: float
     seconds: float  # of the whole training, on whatever machine it ran
-    options: Mapping[str, Any] = field(default_factory=dict)  # of its search
+    options: Mapping[str, Any] = field(default_factory=dict)  # search settings, for result keys
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Compared:
     reused: int  # how many of the errors were found in a results file
 
     def row(self) -> str:
-        """Of the table."""
+        """One line of the table."""
         return (
             f"{self.name:<10} {self.split:<18} {self.count:>5} {self.samples_seen:>9,} "
             f"{self.flops:9.1e} {self.training_seconds / 60:8.0f} {self.inference_seconds:8.2f}  "
@@ -131,7 +131,11 @@ def counted(step: Callable[[], Any]) -> float:
 
 
 def paper_flops(model: PaperModel, card: dict) -> float:
-    """Of training on one sample, the encoder included; mean over wide steps and Langevin steps."""
+    """Floating point operations of training a network of the paper on one sample.
+
+    Includes the encoder; the mean over all steps, of which some are wide and some run Langevin
+    dynamics.
+    """
     config = replaced(PaperTraining(), _known(card["training"]), "card")
     config = dataclasses.replace(config, batch=1, bf16=False)
     samples = replaced(SampleConfig(), card["samples"], "card")
@@ -157,7 +161,7 @@ def _known(training: dict) -> dict:
 
 
 def descriptor_flops(weights: Path) -> float:
-    """Of training the default aligner's descriptors on one sample."""
+    """Floating point operations of training the default aligner's descriptors on one sample."""
     net, card = load_descriptor(weights)
     net.train().requires_grad_(True)
     known = {field.name for field in dataclasses.fields(DescriptorTraining)}

@@ -1,4 +1,4 @@
-"""How good the deformed implicit field is: correspondence, validity of deformed meshes, pictures.
+"""Quality of the deformed implicit field: correspondence, validity of deformed meshes, pictures.
 
 `iga view deformations --out DIR` writes contact sheets of deformed shapes whose colours are the
 canonical positions of their points, so that equal colours correspond.
@@ -38,7 +38,7 @@ class CorrespondenceErrors:
     baseline_median: float
 
     def row(self) -> str:
-        """One line."""
+        """The values as one line of text."""
         return (
             f"{self.pairs} pairs: nearest in the template space {100 * self.template_mean:.1f} % "
             f"mean, {100 * self.template_median:.1f} % median; nearest in the normalised space "
@@ -117,7 +117,7 @@ class Validity:
     valid: float  # all of these
 
     def row(self) -> str:
-        """One line."""
+        """The values as one line of text."""
         return (
             f"{self.draws} draws: closed {100 * self.closed:.1f} %, positive volume "
             f"{100 * self.volume:.1f} %, unfolded {100 * self.unfolded:.1f} %, no new crossings "
@@ -128,7 +128,7 @@ class Validity:
 def validity(
     deformer: DifNetDeformer, names: Sequence[str], draws: int, *, seed: int = 0
 ) -> Validity:
-    """Over `draws` instances and seeds of each of the families `names`."""
+    """Validity of deformed meshes over `draws` random instances of each of the families `names`."""
     rows = []
     for name in names:
         for k in range(draws):
@@ -167,7 +167,10 @@ def deformation_sheet(
 
 
 def make_deformer(name: str, scale: float, weights: Path | None = None) -> Deformer:
-    """One of DEFORMERS, `scale` times as strong as by default; `weights` are DIF-Net's."""
+    """The deformer `name` of DEFORMERS, `scale` times as strong as by default.
+
+    `weights`: checkpoint for DIF-Net; the others have none.
+    """
     if name == "lattice":
         return LatticeDeformer(amplitude=0.06 * scale, scale=0.2 * scale)
     if name == "parts":

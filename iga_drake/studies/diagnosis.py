@@ -31,7 +31,7 @@ from iga_drake.training.descriptor import DescriptorTraining
 WRONG = np.radians(45)  # a coarse hypothesis further off than this is wrong
 TERCILES = ("least", "middle", "most")
 LOWER = 1e-3  # an energy counts as lower than another where it is by this much
-# What a pose is called in the table, and how it was found.
+# Poses that are compared: key -> name in the table, which says how the pose was found.
 POSES = {
     "plain": "found, plain",
     "found": "found",
@@ -50,20 +50,20 @@ MATCHES = {
 
 @dataclass(frozen=True)
 class Problem:
-    """A sample, and what an aligner is asked about it."""
+    """A sample with the query that an aligner gets for it."""
 
     sample: Sample
     query: Query
 
     @staticmethod
     def of(split: str, index: int, demonstrations: int | None = None) -> "Problem":
-        """Sample `index` of a set with its first demonstrations (default: all)."""
+        """The problem of sample `index` of a set with its first demonstrations (default: all)."""
         sample = make_sample(split, index, CONFIG)
         shown = [*range(sample.points.shape[1] - 1)[:demonstrations], -1]
         return Problem(sample, Query.of(sample.points[:, shown], random_pose(index)))
 
     def with_first(self, demonstrations: int) -> "Problem":
-        """The same with fewer demonstrations."""
+        """The same problem with only the first `demonstrations` demonstrations."""
         query = replace(self.query, context=self.query.context[:demonstrations])
         return Problem(self.sample, query)
 
@@ -72,26 +72,27 @@ class Problem:
         return equivalents(self.sample, symmetry=True) @ np.linalg.inv(self.query.start)
 
     def error(self, X_WF: np.ndarray, *, symmetry: bool = True) -> tuple[float, float]:
-        """Errors (m, rad) of an answer (4, 4)."""
+        """Errors (m, rad) of an answer X_WF (4, 4), by default modulo symmetry."""
         valid = equivalents(self.sample, symmetry=symmetry)
         return nearest_error(X_WF @ self.query.start, valid, self.sample.points[0, -1])
 
 
 @dataclass(frozen=True)
 class ObjectMatches:
-    """One object of a sample against one demonstration."""
+    """Match errors of one object of a sample against one demonstration."""
 
     category: str
-    # rad, of every coarse hypothesis, best first: distance from the true rotation
+    # Angle (rad) of every coarse hypothesis from the true rotation, best hypothesis first.
     off: tuple[float, ...]
-    off_modulo: tuple[float, ...]  # modulo the family's symmetry
-    # m and share of the size: mean over nodes, and their median share; by the names of MATCHES
+    off_modulo: tuple[float, ...]  # the same modulo the family's symmetry
+    # Match errors over nodes, by the names of MATCHES: mean (m), mean and median as shares of the
+    # object's size.
     error: dict[str, tuple[float, float, float]]
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """One sample. Errors are (m, rad), modulo symmetry but for `plain`."""
+    """Diagnosis of one sample. Errors are (m, rad), modulo symmetry except `plain`."""
 
     split: str
     index: int
@@ -163,8 +164,11 @@ def hypothesis_errors(
 def match_errors(
     sample: Sample, explanation: Explanation, role: int, d: int, within: float
 ) -> dict[str, tuple[float, float, float]]:
-    """Of the matches of test nodes whose true match is seen `within` that share of the size:
-    see `ObjectMatches.error`. Not modulo symmetry."""
+    """Match errors as in `ObjectMatches.error`, not modulo symmetry.
+
+    Counts only test nodes whose true match lies `within` this share of the size of some node of
+    demonstration d. Empty if there are none.
+    """
     places = _places(sample, explanation.index)[role]
     test, demonstration = places[-1], places[d]
     distance = torch.cdist(test, demonstration)
@@ -219,7 +223,7 @@ def descend(energy: Callable[[Tensor], Tensor], X: np.ndarray, centre: np.ndarra
 
 
 def diagnose_sample(aligner: IgaAligner, split: str, index: int) -> Diagnosis:
-    """One sample of a set."""
+    """The diagnosis of sample `index` of a set."""
     training = DescriptorTraining()
     problem = Problem.of(split, index)
     sample = problem.sample
@@ -277,16 +281,16 @@ def _best(problem: Problem, estimate: PoseEstimate) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Shares of wrong coarse hypotheses; the second of each pair is modulo symmetry."""
+    """Shares of wrong coarse hypotheses; each pair is plain, then modulo symmetry."""
 
     count: int  # objects matched with a demonstration
     first: tuple[float, float]  # the best one is wrong
-    kept: tuple[float, float]  # of all
+    kept: tuple[float, float]  # share of wrong ones among all hypotheses
     none: tuple[float, float]  # no hypothesis is right
 
     @staticmethod
     def of(objects: Sequence[ObjectMatches]) -> "Hypotheses":
-        """Over some objects."""
+        """The shares over several objects."""
         off = [[np.array(a) > WRONG for a in (o.off, o.off_modulo)] for o in objects]
 
         def share(wrong: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float]:
@@ -304,29 +308,29 @@ class Hypotheses:
         )
 
     def columns(self) -> str:
-        """Part of a row of the table: percentages, plain and modulo symmetry."""
+        """The percentages, plain and modulo symmetry, as the text columns of one table line."""
         pairs = (self.first, self.kept, self.none)
         return "   ".join(f"{100 * a:5.1f} {100 * b:5.1f}" for a, b in pairs)
 
 
 @dataclass(frozen=True)
 class Summary:
-    """A set."""
+    """The diagnoses of a set's samples, summarised."""
 
     split: str
     count: int
-    errors: dict[str, tuple[int, Errors]]  # by the names of POSES; over how many samples
+    errors: dict[str, tuple[int, Errors]]  # by the names of POSES: number of samples, errors
     below_truth: float  # share of samples whose found energy is below the truth's
     gap_median: float  # of the truth's energy minus the found one's
     missed: float  # share on which a descent from the truth ends lower than one from the found pose
     matches: dict[str, tuple[float, float, float]]  # by the names of MATCHES: cm, %, median %
     hypotheses: Hypotheses
     categories: dict[str, Hypotheses]
-    # of each of TERCILES: bounds of the deformation, errors of the found pose
+    # For each of TERCILES: least and greatest deformation, errors of the found pose.
     deformation: tuple[tuple[float, float, Errors], ...]
 
     def table(self, *, categories: bool = False) -> str:
-        """Text of many lines."""
+        """The summary as text; with `categories` also coarse hypotheses by category."""
         lines = [
             f"{self.split}, {self.count} samples; errors modulo symmetry unless said otherwise",
             f"{'':<22} {'count':>5}  {'cm mean ± std (median)':<21}  "
@@ -360,7 +364,7 @@ class Summary:
 
 
 def summarise_diagnoses(rows: Iterable[Diagnosis]) -> Summary:
-    """Over the samples of one set."""
+    """The summary of the diagnosed samples of one set."""
     rows = list(rows)
     objects = [o for row in rows for o in row.objects]
     errors = {}

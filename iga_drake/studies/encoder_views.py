@@ -1,4 +1,4 @@
-"""What the local encoder knows of the parts of a cloud, drawn as the paper draws it.
+"""Pictures of the occupancy that the local encoder predicts, as in the paper.
 
 `iga view reconstruction --png OUT` writes a row of pictures for each sample: the cloud (blue) with
 its centres (yellow); the same with query points that the decoder says are occupied (red) and free
@@ -84,7 +84,10 @@ def reconstruction_sheet(
 def predicted(
     net: OccupancyNet, sample: OccupancySample, index: torch.Tensor, queries: np.ndarray
 ) -> np.ndarray:
-    """Which queries (Q, 3) the network says are occupied (Q,), with centres `index` (1, K)."""
+    """Predicted occupancy (Q,) bool of `queries` (Q, 3) (m).
+
+    `index` (1, K) selects the points of the sample's cloud that are the encoder's centres.
+    """
     with torch.no_grad():
         features = net.encoder(torch.from_numpy(sample.points)[None], index=index)
         logits = [

@@ -27,7 +27,8 @@ REACH = 0.06  # m, of the plane of translations and along the axis
 STEPS = 61  # of a heat map, each way
 CLIP = 12.0  # energies this far above the lowest look the same
 LINES = 32  # matches drawn of each object and demonstration: its first nodes, evenly spread
-# Of matches and parts in Meshcat, from a guess to sure: blue, cyan, green, orange, red.
+# Colours of matches and parts in Meshcat, by confidence from least to most: blue, cyan, green,
+# orange, red.
 LEVEL_COLORS = (
     (0.25, 0.30, 0.80, 1.0),
     (0.15, 0.65, 0.90, 1.0),
@@ -41,7 +42,7 @@ VIEW = np.array([[-0.64, 0.77, 0.0], [-0.30, -0.25, 0.92]])  # (2, 3) across and
 
 @dataclass(frozen=True)
 class ExplainedProblem:
-    """A problem, what was found and why, and the right answer."""
+    """An alignment problem with the aligner's explanation of its answer, and the true pose."""
 
     name: str
     problem: Problem
@@ -52,7 +53,7 @@ class ExplainedProblem:
     def of(
         aligner: IgaAligner, split: str, index: int, demonstrations: int | None
     ) -> "ExplainedProblem":
-        """Sample `index` of a set."""
+        """The explained problem of sample `index` of a set; `demonstrations` None: all."""
         problem = Problem.of(split, index, demonstrations)
         explanation = aligner.explain(*problem.query.clouds, seed=index)
         valid = problem.valid()
@@ -63,16 +64,16 @@ class ExplainedProblem:
 
     @property
     def best(self) -> Tensor:
-        """(4, 4) the best mode."""
+        """Pose X_WF (4, 4) of the best mode."""
         return torch.from_numpy(self.explanation.estimate.poses[0])
 
     @property
     def centre(self) -> Tensor:
-        """(3,) of the grasped cloud, in its frame."""
+        """Centre (3,) (m) of the grasped cloud, in its frame."""
         return torch.from_numpy(self.problem.query.grasped.mean(0))
 
     def text(self) -> str:
-        """The modes, a line each."""
+        """A summary of the problem, then a line for each mode: energy, probability, error."""
         truth = float(self.explanation.energy(torch.from_numpy(self.truth)))
         lines = [
             f"{self.name}: A {self.problem.sample.category[0]}, "
@@ -215,15 +216,18 @@ def match_lines(explanation: Explanation, role: int, d: int, count: int = LINES)
 
 
 def _clouds(query: Query, role: int) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The test cloud, as the aligner got it, and the demonstrations'."""
+    """An object's test cloud, as the aligner got it, and its cloud in each demonstration."""
     if role == 0:
         return query.grasped, [a.grasped for a in query.context]
     return query.target, [a.target for a in query.context]
 
 
 def correspondence_figure(explained: ExplainedProblem, path: Path) -> None:
-    """Of each object and demonstration: the test cloud (left), the demonstration's, turned as the
-    test cloud lies, and lines between matches, coloured by confidence."""
+    """Draws the matches to a PNG file, a panel for each object and demonstration.
+
+    A panel shows the test cloud (left), the demonstration's, turned as the test cloud lies, and
+    lines between matches, coloured by confidence.
+    """
     from matplotlib.collections import LineCollection
 
     demonstrations = len(explained.problem.query.context)
@@ -293,7 +297,8 @@ def _at_least(limits: tuple[float, float], span: float) -> tuple[float, float]:
 def _posed_parts(
     explained: ExplainedProblem, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray, str]]]:
-    """In W: A's cloud at the best mode, B's, and of both their parts, shares and a colour."""
+    """In W (m): A's cloud at the best mode, B's cloud, and for each object its parts' nodes (n, 3),
+    their shares (n,) of the support, and an edge colour."""
     X = explained.best.numpy()
     A = explained.problem.query.grasped @ X[:3, :3].T + X[:3, 3]
     P, Q = weights.shape

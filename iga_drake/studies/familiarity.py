@@ -27,31 +27,34 @@ DEFAULT_SETS = ("unseen_instances", "unseen_categories")
 
 @dataclass(frozen=True)
 class Familiarity:
-    """Of the samples of a set."""
+    """Familiarities, in [0, 1], of a set's samples with their own and with foreign demonstrations."""
 
     split: str
-    own: tuple[float, ...]
-    foreign: tuple[float, ...]  # in turn of FOREIGN_KINDS
+    own: tuple[float, ...]  # one a sample
+    foreign: tuple[float, ...]  # one a sample; the kinds of FOREIGN_KINDS take turns
 
     def refused(self, threshold: float) -> float:
         """Share of the samples with their own demonstrations below a threshold."""
         return float((np.array(self.own) < threshold).mean())
 
     def accepted(self, threshold: float, kind: int | None = None) -> float:
-        """Share of the samples with foreign ones at or above it; of all or of one kind."""
+        """Share of the samples with foreign demonstrations at or above a threshold.
+
+        `kind`: index into FOREIGN_KINDS; None: all kinds. NaN if there are no such samples.
+        """
         values = np.array(
             self.foreign if kind is None else self.foreign[kind :: len(FOREIGN_KINDS)]
         )
         return float((values >= threshold).mean()) if len(values) else float("nan")
 
     def area(self) -> float:
-        """Under the curve of the receiver's operating characteristic: how often an own context
-        looks more familiar than a foreign one (Mann & Whitney 1947)."""
+        """Area under the ROC curve: how often an own context looks more familiar than a foreign one
+        (Mann & Whitney 1947)."""
         difference = np.subtract.outer(np.array(self.own), np.array(self.foreign))
         return float(((difference > 0) + 0.5 * (difference == 0)).mean())
 
     def table(self) -> str:
-        """Text of many lines."""
+        """The shares refused and accepted at each of THRESHOLDS, as text."""
         kinds = "".join(f"{name:>9}" for name in FOREIGN_KINDS)
         lines = [
             f"{self.split}, {len(self.own)} samples; own contexts look more familiar than foreign "
@@ -70,8 +73,10 @@ class Familiarity:
 
 
 def measure_familiarity(aligner: Aligner, split: str, count: int) -> Familiarity:
-    """Over the first `count` samples of a set. Raises `IgaDrakeError` for an aligner that can't
-    tell."""
+    """Familiarities over the first `count` samples of a set.
+
+    Raises `IgaDrakeError` for an aligner whose estimates have no familiarity.
+    """
     own: list[float] = []
     foreign: list[float] = []
     for index in range(count):
@@ -98,7 +103,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace, aligner: Aligner | None = None) -> int:
-    """Prints both kinds of error by threshold."""
+    """Prints the shares of refused own and accepted foreign contexts by threshold."""
     names: Sequence[str] = arguments.sets.split(",")
     for name in names:
         sample_set(name)

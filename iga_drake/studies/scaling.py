@@ -30,7 +30,7 @@ STAGES = ("describe", "across", "match", "vote", "energy")
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one alignment with D demonstrations."""
+    """Cost and errors of an alignment with D demonstrations, over several samples."""
 
     demonstrations: int
     nodes: int  # of all clouds of both objects
@@ -38,14 +38,15 @@ class Cost:
     across: int  # pairs of nodes of different clouds of one object, each layer
     proposals: int  # poses that pairs of parts propose
     comparisons: int  # of two proposals of the same pair
-    # s, medians over samples; `across` is the part of `describe` in attention between clouds
+    # Median time (s) of each of STAGES; "across" is the part of "describe" spent in attention
+    # between clouds.
     seconds: dict[str, float]
     total: float  # s, median
     memory: int  # bytes of tensors, peak over the largest of the samples measured
     errors: Errors  # modulo symmetry
 
     def row(self) -> str:
-        """Of the table."""
+        """One line of the table."""
         stages = " ".join(f"{self.seconds[stage]:8.3f}" for stage in STAGES)
         return (
             f"{self.demonstrations:>5} {self.nodes:>6} {self.within:>9,} {self.across:>9,} "
@@ -84,7 +85,7 @@ def peak_memory(action: Callable[[], Any]) -> int:
 
 @contextmanager
 def _quiet_stderr() -> Iterator[None]:
-    """Without what the profiler's native code writes there."""
+    """Discards what native code (the profiler's) writes to standard error in the block."""
     sys.stderr.flush()
     kept = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -248,7 +249,7 @@ class DiversityErrors:
     errors: Errors
 
     def row(self) -> str:
-        """Of the table."""
+        """One line of the table."""
         return f"{self.split:<17} {self.demonstrations:>5} {self.count:>6}  {self.errors.columns()}"
 
 

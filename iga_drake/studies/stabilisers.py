@@ -32,20 +32,24 @@ from iga_drake.training.paper import (
 )
 from iga_drake.training.run import RunOptions
 
-AWAY = {"rotation": math.radians(30), "translation": 0.05}  # rad, m
+# Distance (rad, m) from the right pose at which descents start, and within which one is home.
+AWAY = {"rotation": math.radians(30), "translation": 0.05}
 HOME = {"rotation": math.radians(10), "translation": 0.02}
 ABLATIONS = ("all", "no-spectral", "no-energy-penalty", "no-gradient-penalty", "no-langevin")
 
 
 @dataclass(frozen=True)
 class Convergence:
-    """Of one network, over starts of several samples; shares of 1."""
+    """How descents of one network's energy end, over several starts for each sample.
 
-    home: float  # end within HOME
-    nearer: float  # end nearer than they began
-    uphill: float  # begin where the gradient leads away
-    final_median: float  # deg or cm
-    starts: int
+    The first three are shares of the starts, in [0, 1].
+    """
+
+    home: float  # share that ends within HOME of the right pose
+    nearer: float  # share that ends nearer to it than it began
+    uphill: float  # share that begins where descent leads away from it
+    final_median: float  # median distance at the end, deg (rotation) or cm (translation)
+    starts: int  # number of starts
 
 
 def measure_convergence(
@@ -132,7 +136,7 @@ HEADER = f"{'run':<24} {'home':>6} {'nearer':>7} {'uphill':>7}  ends (median)  {
 
 
 def row(name: str, part: str, found: Convergence, loss: float | None) -> str:
-    """Of the table."""
+    """One line of the table under `HEADER`."""
     unit = "deg" if part == "rotation" else "cm"
     text = "" if loss is None else f"{loss:6.3f}"
     return (

@@ -21,7 +21,7 @@ _WISH = -0.05  # m or rad
 
 @dataclass
 class DifferentialIkConfig:
-    """How fast and how close to its limits the arm may move."""
+    """Limits on speed and on closeness to limits for differential inverse kinematics."""
 
     # Time (s) over which the solver looks ahead: a pose error is left to decay at this time
     # constant, and a clearance or a step too far likewise.

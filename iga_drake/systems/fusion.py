@@ -1,4 +1,4 @@
-"""From the depth and label images of several cameras to clouds of target and grasped object."""
+"""Fuses depth and label images of several cameras to clouds of target and grasped object."""
 
 import math
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ class FusionError(IgaDrakeError):
 
 @dataclass
 class FusionConfig:
-    """How depth images become clouds."""
+    """Settings of the fusion: voxels, crop box, and which pixels and specks are dropped."""
 
     # Edge length of a voxel (m).
     voxel_size: float = 0.005
@@ -53,12 +53,12 @@ class FusionConfig:
 
 @dataclass(frozen=True)
 class CameraCounts:
-    """What one camera delivered, in pixels; `valid` = 0 means that it delivered nothing."""
+    """Pixel counts of one camera's images; `valid` = 0 means that it delivered nothing."""
 
     valid: int  # pixels with a depth
     target: int  # pixels used for the target's cloud, before the voxel filter
     grasped: int  # pixels used for the grasped object's cloud, before the voxel filter
-    # Why nothing of it was used, in words that follow the camera's name; empty if some was.
+    # Why none of its pixels was used, in words to follow the camera's name; empty if some were.
     problem: str = ""
 
 
@@ -181,7 +181,7 @@ class PointCloudFusion(LeafSystem):
         value.set_value(FusedClouds(target, grasped, counts))
 
     def _find_problem(self, name: str, context: Context) -> str:
-        """Why this camera's images can't be used; empty if they can."""
+        """The reason, in words, why this camera's images can't be used; empty if they can."""
         port = self._times[name]
         if not port.HasValue(context):
             return ""

@@ -19,7 +19,7 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True)
 class EndEffectorTarget:
-    """One step for the waypoint follower: go there, then set the hand, then settle."""
+    """One target of the waypoint follower: move to a pose, then set the hand, then settle."""
 
     # Rises by one with every new target; the follower reports the last one it finished.
     sequence: int
@@ -40,7 +40,7 @@ class EndEffectorTarget:
     contact_force: float | None = None
 
 
-# What a port carries before there is any target. (Drake's abstract values can't hold None.)
+# Value of a target port before there is any target. (Drake's abstract values can't hold None.)
 NO_TARGET = EndEffectorTarget(
     sequence=0, X_WE=RigidTransform(), opening_moving=0.0, opening_reached=0.0
 )
@@ -48,7 +48,7 @@ NO_TARGET = EndEffectorTarget(
 
 @dataclass(frozen=True)
 class FollowerStatus:
-    """What the waypoint follower reports."""
+    """The waypoint follower's report: the last target it finished and the distance left."""
 
     # The last target whose pose was reached and whose settling time is over (0: none).
     sequence_reached: int = 0

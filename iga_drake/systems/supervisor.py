@@ -13,7 +13,7 @@ from iga_drake.systems.messages import Cause, SupervisorStatus
 
 @dataclass
 class SupervisorConfig:
-    """What is allowed. Limits of the joints themselves come from the robot."""
+    """Limits that the supervisor enforces besides the robot's own joint limits."""
 
     # Share of the joints' velocity limits allowed, in the commands and as measured.
     velocity_scale: float = 1.0
@@ -46,7 +46,7 @@ class SupervisorConfig:
 
 @dataclass(frozen=True)
 class _Memory:
-    """What the supervisor remembers from one check to the next."""
+    """The supervisor's discrete state: the last good command, overload and status."""
 
     position: np.ndarray | None = None  # last command that was good
     time_overloaded: float | None = None  # since when the torque is too high (s)

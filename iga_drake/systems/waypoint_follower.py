@@ -21,7 +21,7 @@ _LEFT_BEHIND = 0.05
 
 @dataclass
 class WaypointFollowerConfig:
-    """How the arm follows waypoints: rate, speeds, ramps and tolerances."""
+    """Settings of the waypoint follower: rate, speeds, ramps and tolerances."""
 
     # Time between two commands to the arm (s).
     period: float = 0.01
@@ -42,7 +42,7 @@ class WaypointFollowerConfig:
 
 @dataclass(frozen=True)
 class _Motion:
-    """What the follower remembers from one update to the next."""
+    """The follower's discrete state: the motion under way and its progress."""
 
     target: EndEffectorTarget | None = None
     path: Path | None = None

@@ -57,7 +57,7 @@ ALIGNED_POSITION, ALIGNED_ROTATION = 0.03, np.radians(25.0)
 
 @dataclass(frozen=True, kw_only=True)
 class WaypointResult:
-    """What became of one waypoint that was inferred."""
+    """One inferred waypoint: the predicted and the expert's pose, and the error between them."""
 
     name: str
     estimate: PoseEstimate
@@ -94,7 +94,7 @@ class WaypointResult:
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeResult:
-    """What became of an episode."""
+    """The outcome of one episode: verdict, timeline, measures and inferred waypoints."""
 
     task: str
     aligner: str
@@ -103,15 +103,15 @@ class EpisodeResult:
     # `Scenario.digest`.
     scenario: str
     success: bool
-    # Kind of the reason when failed.
+    # Kind of the failure; None after a success.
     cause: Cause | None = None
     reason: str = ""
     timeline: tuple[PhaseEntry, ...] = ()
-    # What the success predicates measured (SI).
+    # Values measured by the success predicates (SI units), by name.
     measures: Mapping[str, float] = field(default_factory=dict)
-    # One for each waypoint that was inferred.
+    # The inferred waypoints in the order of inference.
     waypoints: tuple[WaypointResult, ...] = ()
-    # What was observed, by the names that the task gives its clouds.
+    # The observed clouds, by the names that the task gives them.
     observations: Mapping[str, Observation] = field(default_factory=dict)
     build_seconds: float = 0.0
     wall_seconds: float = 0.0
@@ -186,7 +186,7 @@ class ExpertInference:
     name = EXPERT
 
     def __init__(self, poses: Callable[[], tuple[RigidTransform, ...]]) -> None:
-        """`poses`: gives the expert's X_WE now, one a waypoint."""
+        """`poses()` returns the expert's present X_WE of every waypoint."""
         self._poses = poses
         self._waypoint = 0
 
@@ -201,14 +201,14 @@ class ExpertInference:
         return InferenceAnswer(PoseEstimate(X_WE[None], np.zeros(1), np.ones(1)), 0.0)
 
     def cancel(self) -> None:
-        """Nothing is ever under way."""
+        """Does nothing: the expert answers at once."""
 
     def close(self) -> None:
-        """Nothing runs."""
+        """Does nothing: there is no process to end."""
 
 
 def demonstrations_path(scenario: Scenario) -> Path:
-    """Where the scenario's demonstrations lie."""
+    """The folder of the scenario's demonstrations; relative paths start at `models/`."""
     path = Path(scenario.demonstrations)
     return path if path.is_absolute() else models_dir() / path
 
@@ -326,13 +326,13 @@ class Episode:
 
     @property
     def memory(self) -> PolicyMemory:
-        """What the policy remembers now."""
+        """The policy's whole state at the present time."""
         policy = self.robot.policy
         return policy.memory(policy.GetMyContextFromRoot(self.simulator.get_context()))
 
     @property
     def status(self) -> PolicyStatus:
-        """What the policy reports now."""
+        """The policy's phase, timeline and reason at the present time."""
         return self.memory.status
 
     @property
@@ -487,7 +487,7 @@ class Episode:
         )
 
     def demonstration(self) -> Demonstration:
-        """What the cameras and the arm recorded of the episode, without anything privileged.
+        """The episode as a demonstration: only what the cameras and the arm recorded, no true state.
 
         Raises `TaskError` unless all waypoints were reached.
         """

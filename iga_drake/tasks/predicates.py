@@ -66,15 +66,16 @@ class AllOf(Predicate):
 
 @dataclass(frozen=True, kw_only=True)
 class CountOf(Predicate):
-    """At least `at_least` of `predicates` hold, say of one for each marble.
+    """At least `at_least` of `predicates` hold (one for each marble, say).
 
-    It measures their number as "count"; what they measure themselves is left out.
+    Its one measure "count" is the number that hold; the predicates' own measures are dropped.
     """
 
     predicates: tuple[Predicate, ...]
     at_least: int
-    # Prefix of the measure's name, and what the reason says instead of the general words.
+    # Prefix of the measure's name.
     name: str = ""
+    # Replaces the general words of the failure reason; empty keeps them.
     otherwise: str = ""
 
     def __post_init__(self) -> None:
@@ -104,7 +105,7 @@ class WindowPredicate(Predicate):
     for_last: float = 0.0
     # Prefix of the measure's name, for compositions in which two predicates measure the same.
     name: str = ""
-    # What the reason says instead of the general words.
+    # Replaces the general words of the failure reason; empty keeps them.
     otherwise: str = ""
 
     def __post_init__(self) -> None:
@@ -124,7 +125,7 @@ class WindowPredicate(Predicate):
 
     @abstractmethod
     def _judge_window(self, scene: Scene, window: Sequence[Snapshot]) -> Verdict:
-        """Judges the snapshots of the window, at least one."""
+        """The verdict on the snapshots of the window, of which there is at least one."""
 
     def _during(self) -> str:
         return f" within the last {self.for_last:g} s" if self.for_last > 0 else ""
@@ -195,7 +196,7 @@ class MeasuredPredicate(WindowPredicate):
 
     @abstractmethod
     def _text(self) -> str:
-        """What is said of the object where it doesn't hold."""
+        """The failure reason in words, without the numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -329,7 +330,7 @@ class Below(MeasuredPredicate):
     object: str
     other: str
     depth: float
-    # As in `NearAxis`.
+    # Name of the point, as `NearAxis.point`.
     point: str = ""
     frame: str = "opening"
 
@@ -353,7 +354,7 @@ class Within(MeasuredPredicate):
     other: str
     distance: float
     frame: str
-    # As in `NearAxis`.
+    # Name of the point, as `NearAxis.point`.
     point: str = ""
 
     def _values(self, scene: Scene, window: Sequence[Snapshot]) -> np.ndarray:
@@ -380,9 +381,9 @@ class Inside(MeasuredPredicate):
     object: str
     other: str
     margin: float = 0.0
-    # Part names of the other; (): the whole of it.
+    # Names of the parts of `other` that span the hull; empty: all its parts.
     parts: tuple[str, ...] = ()
-    # As in `NearAxis`.
+    # Name of the point, as `NearAxis.point`.
     point: str = ""
 
     def _values(self, scene: Scene, window: Sequence[Snapshot]) -> np.ndarray:

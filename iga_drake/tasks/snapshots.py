@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context
 from iga_drake.errors import IgaDrakeError
 from iga_drake.station.panda.model import PandaModel
 
-# What objects touch besides each other. No object can be called "world" in an SDF.
+# Names, in contacts, of the bodies that are not objects. SDF forbids an object called "world".
 ROBOT = "robot"
 TABLE = "world"
 

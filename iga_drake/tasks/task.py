@@ -1,4 +1,4 @@
-"""What every task gives: shapes, seeded scenes, an expert's waypoint, what counts as success."""
+"""The interface of a task: its shapes, seeded scenes, expert waypoints and success goal."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -57,7 +57,7 @@ class Task(ABC):
 
     @abstractmethod
     def goal(self, truth: SceneTruth) -> Predicate:
-        """What has to hold for an episode with these shapes to be a success."""
+        """The success condition of an episode with the shapes of `truth`."""
 
     def success(self, scene: Scene, snapshots: Sequence[Snapshot]) -> Verdict:
         """Judges an episode by the task's goal, from its true states in order of time.
@@ -108,5 +108,5 @@ class Task(ABC):
 def _shapes_once(
     make_shapes: Callable[[int], Mapping[str, ShapeInstance]], seed: int
 ) -> Mapping[str, ShapeInstance]:
-    """What `make_shapes` returns for the seed, made once a process."""
+    """`make_shapes(seed)`, computed once per process and function."""
     return make_shapes(seed)

@@ -51,7 +51,7 @@ def turned_pairs(sample: Sample) -> np.ndarray:
 
 
 def _point_radii(points: np.ndarray, aligned: np.ndarray) -> np.ndarray:
-    """(2, N, P) m: of the points (2, N, P, 3) of each pair."""
+    """Radii (2, N, P) (m) of the balls that show points (2, N, P, 3), larger where `aligned`."""
     extent = np.ptp(points, axis=(0, 2)).max(axis=-1)  # (N,)
     return POINT_RADII[aligned.astype(int)] * extent[:, None]
 
@@ -67,7 +67,7 @@ def point_colors(sample: Sample, coloring: Coloring) -> np.ndarray:
 
 
 def pair_names(sample: Sample) -> list[str]:
-    """What each pair is, with its mode where there are several."""
+    """A title for each pair ("demonstration 0", "test"), with its mode if a sample has several."""
     pairs = sample.points.shape[1]
     names = [f"demonstration {n}" for n in range(pairs - 1)] + ["test"]
     if len(set(sample.mode.tolist())) > 1:

@@ -19,7 +19,7 @@ from iga_drake.errors import check_range
 
 @dataclass
 class Visualization:
-    """What a person may look at while it runs."""
+    """Settings of the Meshcat visualization."""
 
     # Starts a Meshcat server (on this machine only).
     meshcat: bool = False

@@ -1,4 +1,4 @@
-"""What a real depth camera does to a perfect image, and what calibration does to its pose."""
+"""Errors of a real depth camera: noise in its images, and the calibration error of its pose."""
 
 import math
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from iga_drake.errors import check_range
 
 @dataclass
 class CalibrationError:
-    """How far the exported camera pose is from the true one."""
+    """Size of the difference between the exported and the true camera pose."""
 
     # Whether there is an error at all.
     enabled: bool = True
@@ -26,9 +26,9 @@ class CalibrationError:
     maximum: float = 0.005
     # Angle of the rotation part (rad), >= 0; `rotation * radius` at most (maximum - minimum) / 2.
     rotation: float = 0.002
-    # The work area is the ball around this point of W (m), the rotation's pivot...
+    # Centre of the work area, a ball, in W (m); the error's rotation turns about it.
     center: list[float] = field(default_factory=lambda: [0.5, 0.0, 0.15])
-    # ...with this radius (m), > 0.
+    # Radius of the work area (m), > 0.
     radius: float = 0.35
 
     def check(self, where: str) -> None:

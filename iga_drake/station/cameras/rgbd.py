@@ -188,9 +188,9 @@ def camera_info(intrinsics: Intrinsics) -> CameraInfo:
 
 
 def rendering_info(intrinsics: Intrinsics) -> CameraInfo:
-    """What Drake's renderer has to be given for images with these intrinsics.
+    """The intrinsics to give Drake's renderer so that its images have the intrinsics asked for.
 
-    It takes the first pixel's corner, not its centre, as (0, 0): without this, what is on the
+    The renderer takes the first pixel's corner, not its centre, as (0, 0): without this, what is on the
     optical axis appears half a pixel up and to the left (0.65 mm at 0.8 m).
     """
     k = intrinsics

@@ -1,4 +1,4 @@
-"""What lies on the table and how the robot starts: made by a task, built by a station."""
+"""Initial situations: the objects and the robot's start; made by a task, built by a station."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ class SceneObject:
 
     # Name of the model instance in the plant.
     name: str
-    # Which cloud it belongs to. "other" objects are background to the cameras' labels.
+    # Cloud that its pixels belong to; "other" objects are labelled as background.
     role: ObjectRole
     # SDF text of one model with one link; mesh URIs in it are absolute file URIs.
     sdf: str
@@ -28,12 +28,12 @@ class SceneObject:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneTruth:
-    """What a task knows about a scene beyond what the cameras see.
+    """Privileged knowledge about a scene, which the cameras don't see.
 
     Experts and success predicates read it; nothing of it reaches the policy.
     """
 
-    # Name of the task, and which of its objects these are; empty and 0 for a scene of no task.
+    # Task, split and index of the instance; empty and 0 for a scene that no task made.
     task: str = ""
     split: str = ""
     instance: int = 0
@@ -45,7 +45,7 @@ class SceneTruth:
 
 @dataclass(frozen=True)
 class Scene:
-    """One seeded initial situation."""
+    """One initial situation: free bodies, joint angles and opening of the hand."""
 
     objects: tuple[SceneObject, ...]
     # Joint angles at the start (rad).
