@@ -49,7 +49,7 @@ class Path(Protocol):
         ...
 
     def posture(self, share: float) -> np.ndarray | None:
-        """Nominal joint angles (7,) (rad) at `share` of the way; None keeps the present ones."""
+        """Nominal joint angles (7,) (rad) at `share` of the way; None changes nothing."""
         ...
 
     def duration(self, linear_speed: float, angular_speed: float) -> float:

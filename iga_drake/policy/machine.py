@@ -62,9 +62,9 @@ class PolicyConfig:
     present_limit: float = 20.0
     # Limit (s) of the motion around each waypoint.
     move_limit: float = 60.0
-    # How the loop runs while the aligner works. "lockstep": simulated time waits, so that runs can be
-    # repeated exactly. "delay": the answer arrives `infer_delay` after the question, in simulated
-    # time. "concurrent": the loop runs on and the arm holds until the answer is there.
+    # How the loop runs while the aligner works. "lockstep": simulated time waits, so that runs can
+    # be repeated exactly. "delay": the answer arrives `infer_delay` after the question, in
+    # simulated time. "concurrent": the loop runs on and the arm holds until the answer is there.
     inference: str = "lockstep"
     # Time (s) between question and answer, for "delay".
     infer_delay: float = 1.0
@@ -138,7 +138,7 @@ class PolicyMemory:
     question: int | None = None
     # Wall-clock time at which it began (s).
     asked: float = 0.0
-    # Steps of the motion under way, and the index of the present one.
+    # Steps of the latest motion, and the index of the present one.
     steps: tuple[MotionStep, ...] = ()
     step: int = 0
     # Number of waypoints followed so far.
@@ -232,7 +232,7 @@ class PolicyMachine:
     # What comes next
 
     def _unseen(self, seen: Mapping[str, Observation], followed: int) -> ObservationPlan | None:
-        """The first plan that is due and still to be observed by the cameras; None if there is none."""
+        """The first due plan that the cameras have not observed yet; None if there is none."""
         for plan in self.motion.observations:
             if plan.role != "gripper" and plan.name not in seen and plan.after <= followed:
                 return plan
@@ -464,8 +464,8 @@ class PolicyMachine:
     def _fail(
         self, memory: PolicyMemory, inputs: PolicyInputs, now: float, reason: str, cause: Cause
     ) -> PolicyMemory:
-        """Ends in `Phase.FAILED`: a motion may be under way, so the arm is held at its measured pose
-        and the hand keeps its opening."""
+        """Ends in `Phase.FAILED`: a motion may be under way, so the arm is held at its measured
+        pose and the hand keeps its opening."""
         status = memory.status
         during = status.step or f"{status.phase.value} {status.subject}".strip()
         opening = memory.target.opening_moving

@@ -49,7 +49,7 @@ class PhaseEntry:
     phase: Phase
     # Name of the observation or the waypoint that the phase is about.
     subject: str = ""
-    # Result of the phase before, in words (which mode was chosen, say).
+    # Result of the phase before (points seen, mode chosen) or reason of a failure, in words.
     detail: str = ""
 
     def __str__(self) -> str:

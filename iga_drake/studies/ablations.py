@@ -221,7 +221,7 @@ class EnergyAlone:
     name = "energy"
 
     def __init__(self, aligner: IgaAligner, energy: PairEnergyNet):
-        """`aligner` gives the matches; `energy` ranks and refines the poses."""
+        """`aligner` gives the matches; the poses are minima of `energy`."""
         self._aligner = aligner
         self._energy = energy.double()
 

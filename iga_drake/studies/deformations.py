@@ -169,7 +169,7 @@ def deformation_sheet(
 def make_deformer(name: str, scale: float, weights: Path | None = None) -> Deformer:
     """The deformer `name` of DEFORMERS, `scale` times as strong as by default.
 
-    `weights`: checkpoint for DIF-Net; the others have none.
+    `weights`: checkpoint of DIF-Net, unused by the others; None: the default one.
     """
     if name == "lattice":
         return LatticeDeformer(amplitude=0.06 * scale, scale=0.2 * scale)

@@ -63,7 +63,7 @@ class Problem:
         return Problem(sample, Query.of(sample.points[:, shown], random_pose(index)))
 
     def with_first(self, demonstrations: int) -> "Problem":
-        """The same problem with only the first `demonstrations` demonstrations."""
+        """A copy with only the first `demonstrations` demonstrations."""
         query = replace(self.query, context=self.query.context[:demonstrations])
         return Problem(self.sample, query)
 

@@ -27,7 +27,7 @@ DEFAULT_SETS = ("unseen_instances", "unseen_categories")
 
 @dataclass(frozen=True)
 class Familiarity:
-    """Familiarities, in [0, 1], of a set's samples with their own and with foreign demonstrations."""
+    """Familiarities, in [0, 1], of a set's samples with their own and foreign demonstrations."""
 
     split: str
     own: tuple[float, ...]  # one a sample

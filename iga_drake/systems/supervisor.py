@@ -46,7 +46,7 @@ class SupervisorConfig:
 
 @dataclass(frozen=True)
 class _Memory:
-    """The supervisor's discrete state: the last good command, overload and status."""
+    """The supervisor's abstract state: the last good command, overload and status."""
 
     position: np.ndarray | None = None  # last command that was good
     time_overloaded: float | None = None  # since when the torque is too high (s)

@@ -42,7 +42,7 @@ class WaypointFollowerConfig:
 
 @dataclass(frozen=True)
 class _Motion:
-    """The follower's discrete state: the motion under way and its progress."""
+    """The follower's abstract state: the motion under way and its progress."""
 
     target: EndEffectorTarget | None = None
     path: Path | None = None

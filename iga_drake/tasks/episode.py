@@ -487,7 +487,7 @@ class Episode:
         )
 
     def demonstration(self) -> Demonstration:
-        """The episode as a demonstration: only what the cameras and the arm recorded, no true state.
+        """The episode as a demonstration: records of cameras and arm alone, no true state.
 
         Raises `TaskError` unless all waypoints were reached.
         """

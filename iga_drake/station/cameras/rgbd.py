@@ -190,8 +190,8 @@ def camera_info(intrinsics: Intrinsics) -> CameraInfo:
 def rendering_info(intrinsics: Intrinsics) -> CameraInfo:
     """The intrinsics to give Drake's renderer so that its images have the intrinsics asked for.
 
-    The renderer takes the first pixel's corner, not its centre, as (0, 0): without this, what is on the
-    optical axis appears half a pixel up and to the left (0.65 mm at 0.8 m).
+    The renderer takes the first pixel's corner, not its centre, as (0, 0): without this, a point on
+    the optical axis appears half a pixel up and to the left (0.65 mm at 0.8 m).
     """
     k = intrinsics
     return CameraInfo(k.width, k.height, k.fx, k.fy, k.cx + 0.5, k.cy + 0.5)
