@@ -21,7 +21,7 @@ _WISH = -0.05  # m or rad
 
 @dataclass
 class DifferentialIkConfig:
-    """Limits on speed and on closeness to limits for differential inverse kinematics."""
+    """Settings of differential inverse kinematics: speeds, margins to limits, weights."""
 
     # Time (s) over which the solver looks ahead: a pose error is left to decay at this time
     # constant, and a clearance or a step too far likewise.
