@@ -270,7 +270,7 @@ def _send(connection: Connection, outbox: "SimpleQueue[dict[str, Any] | None]") 
     """Sends what is put into `outbox` until None comes: a full pipe keeps nobody else waiting."""
     while (message := outbox.get()) is not None:
         # A worker that can't take it has died; `poll` finds out.
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, TypeError):  # the latter: closed while it sends
             connection.send(message)
 
 

@@ -264,14 +264,19 @@ class Episode:
                 demonstrations=self.demonstrations,
                 seed=draws,
             )
+            if not self.robot.station.HasSubsystemNamed("plant"):
+                raise TaskError(
+                    f"station '{scenario.station}': no subsystem 'plant' found; an episode knows "
+                    "the true state from it and needs a simulated station"
+                )
+            self._plant = self.robot.station.GetSubsystemByName("plant")
+            self._panda = find_panda(self._plant)
+            self.simulator = Simulator(self.robot.diagram)
+            self._build_seconds = wall.perf_counter() - began
+            self._begin()
         except BaseException:
             self.inference.close()
             raise
-        self._plant = self.robot.station.GetSubsystemByName("plant")
-        self._panda = find_panda(self._plant)
-        self.simulator = Simulator(self.robot.diagram)
-        self._build_seconds = wall.perf_counter() - began
-        self._begin()
 
     def _make_inference(self, aligner: str | Aligner) -> Inference:
         if aligner == EXPERT:

@@ -74,8 +74,10 @@ def ask(inference, seed: int = 0, timeout: float = 30.0):
     return inference.poll(question, timeout)
 
 
-def test_the_answer_is_that_of_the_aligner_itself(capfd, worker):
+def test_the_answer_is_that_of_the_aligner_itself(outside, capfd):
+    worker = WorkerInference("outside", {"offset": 2.0}, make_demonstrations().contexts)
     answer = ask(worker)
+    worker.close()
     expected = make_aligner("outside", offset=2.0).align(
         make_demonstrations().contexts[0], GRIPPER, TARGET
     )

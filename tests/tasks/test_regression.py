@@ -9,7 +9,6 @@ import os
 import pytest
 
 from iga_drake.evaluation.task_success import Trial, evaluate, format_table
-from iga_drake.paths import diagrams_dir
 
 # task -> seeds, and how many of them have to succeed.
 CASES = {"grasp": ((3, 4, 5, 6), 3), "stack": ((3, 4, 5, 6), 3)}
@@ -18,8 +17,10 @@ CASES = {"grasp": ((3, 4, 5, 6), 3), "stack": ((3, 4, 5, 6), 3)}
 @pytest.mark.parametrize("task", CASES)
 def test_learned_aligner_does_the_task(task: str):
     seeds, needed = CASES[task]
-    scenario = str(diagrams_dir() / f"{task}.yaml")
-    trials = [(task, Trial(scenario=scenario, aligner="iga", seed=seed)) for seed in seeds]
+    trials = [
+        Trial(task=task, scenario=task, arguments=(task,), aligner="iga", seed=seed)
+        for seed in seeds
+    ]
     results = evaluate(trials, processes=os.cpu_count() or 1)
     assert sum(result.success for result in results) >= needed, "\n" + format_table(results)
 
@@ -27,7 +28,8 @@ def test_learned_aligner_does_the_task(task: str):
 @pytest.mark.parametrize("task", CASES)
 def test_expert_does_the_task(task: str):
     """What fails here is not perception: the motion, the contact or the verdict."""
-    scenario = str(diagrams_dir() / f"{task}.yaml")
-    (result,) = evaluate([(task, Trial(scenario=scenario, aligner="expert", seed=3))])
+    (result,) = evaluate(
+        [Trial(task=task, scenario=task, arguments=(task,), aligner="expert", seed=3)]
+    )
     assert result.success, result.reason
     assert result.position_error == pytest.approx(0.0, abs=1e-4)
