@@ -6,6 +6,8 @@ What a notebook needs stands here; each name is loaded when it is first used.
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from iga_drake.version import __version__
+
 if TYPE_CHECKING:
     from iga_drake.aligners.registry import make_aligner as make_aligner
     from iga_drake.demonstrations.store import read_demonstrations as read_demonstrations
@@ -13,8 +15,6 @@ if TYPE_CHECKING:
     from iga_drake.station.scenario import load_scenario as load_scenario
     from iga_drake.tasks.episode import Episode as Episode
     from iga_drake.tasks.registry import make_task as make_task
-
-__version__ = "0.1.0"
 
 _HOMES = {
     "Episode": "iga_drake.tasks.episode",

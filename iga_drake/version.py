@@ -4,7 +4,7 @@ import functools
 import hashlib
 from pathlib import Path
 
-from iga_drake import __version__
+__version__ = "0.1.0"
 
 
 @functools.cache

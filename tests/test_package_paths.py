@@ -22,12 +22,3 @@ def test_a_wheel_takes_its_own_folder_before_a_stranger_beside_it(monkeypatch, t
     assert paths.models_dir() == own
     with pytest.raises(IgaDrakeError, match="'diagrams' not found"):
         paths.diagrams_dir()
-
-
-def test_text_is_written_whole_or_not_at_all(tmp_path: Path):
-    path = tmp_path / "new" / "file.txt"
-    paths.write_text(path, "old")
-    with pytest.raises(UnicodeEncodeError):
-        paths.write_text(path, "half \ud800")
-    assert path.read_text() == "old"
-    assert [p.name for p in path.parent.iterdir()] == ["file.txt"]
