@@ -1,5 +1,4 @@
 import math
-import time
 from pathlib import Path
 
 import numpy as np
@@ -261,7 +260,6 @@ def lift(size, mass=0.3):
     plant.SetFreeBodyPose(plant_context, body, RigidTransform([0.5, 0.005, size[2] / 2]))
     position_port.FixValue(context, low)
     opening_port.FixValue(context, [0.08])
-    start = time.perf_counter()
     simulator.AdvanceTo(0.1)
     opening_port.FixValue(context, [0.0])
     simulator.AdvanceTo(1.2)
@@ -270,19 +268,17 @@ def lift(size, mass=0.3):
         position_port.FixValue(context, low + share * (high - low))
         simulator.AdvanceTo(context.get_time() + 0.01)
     simulator.AdvanceTo(3.2)
-    rate = context.get_time() / (time.perf_counter() - start)
     X_WO = body.EvalPoseInWorld(plant_context)
     offset = (model.X_WE(plant_context).inverse() @ X_WO).translation()[1]
     tracking = np.abs(model.get_position(plant_context) - high).max()
     opening = model.get_opening(plant_context)
-    return X_WO.translation()[2] - z_before, offset, opening, tracking, rate
+    return X_WO.translation()[2] - z_before, offset, opening, tracking
 
 
 @pytest.mark.parametrize("size", [(0.02, 0.02, 0.06), (0.06, 0.004, 0.06)])
 def test_boxes_and_thin_walls_are_held_by_friction_alone(size):
-    rise, offset, opening, tracking, rate = lift(size)
+    rise, offset, opening, tracking = lift(size)
     assert rise == pytest.approx(0.15, abs=0.003)
     assert abs(offset) < 0.002
     assert opening == pytest.approx(size[1], abs=0.001)
     assert tracking < 1e-3
-    assert rate > 0.2  # far above 1 on a free core; the machine may be busy
