@@ -6,7 +6,6 @@ share nothing with the families (solid angles, nearest points, hulls).
 
 from collections.abc import Callable
 
-import igl
 import numpy as np
 import trimesh
 from family_checks import inside_pieces, solid_points
@@ -46,8 +45,20 @@ def corners(family: Family) -> list[ShapeInstance]:
 
 
 def winding_numbers(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(P,) how often the surface encloses each point, by solid angles (libigl)."""
-    return igl.winding_number(vertices, np.ascontiguousarray(faces), np.ascontiguousarray(points))
+    """(P,) how often the surface encloses each point, by solid angles (Van Oosterom, Strackee)."""
+    total = np.zeros(len(points))
+    for part in np.array_split(np.arange(len(faces)), max(1, len(faces) * len(points) // 400_000)):
+        a, b, c = (vertices[faces[part, k]][None] - points[:, None] for k in range(3))
+        la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
+        above = np.einsum("pfd,pfd->pf", a, np.cross(b, c))
+        below = (
+            la * lb * lc
+            + np.einsum("pfd,pfd->pf", a, b) * lc
+            + np.einsum("pfd,pfd->pf", b, c) * la
+            + np.einsum("pfd,pfd->pf", c, a) * lb
+        )
+        total += np.arctan2(above, below).sum(axis=1)
+    return total / (2 * np.pi)
 
 
 def components(instance: ShapeInstance) -> list[np.ndarray]:
