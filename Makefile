@@ -26,7 +26,7 @@ check: setup
 	$(BIN)/mypy
 
 test: check
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile --nbmake tests notebooks
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --nbmake tests notebooks
 
 clean:
 	rm -rf $(VENV) outputs
