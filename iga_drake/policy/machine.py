@@ -187,7 +187,6 @@ class PolicyMachine:
         self._gripper = gripper
         self._solve = solve
         self._seed = seed
-        self._plans = {plan.name: plan for plan in motion.observations}
 
     def start(self) -> PolicyMemory:
         """The memory before the first tick: the arm stays, the hand keeps its approach opening."""
