@@ -1,4 +1,4 @@
-"""Whether a demonstration can be true: sizes, units and frames, before a robot acts on it."""
+"""Checks of a demonstration's sizes, units and frames, made before a robot acts on it."""
 
 import numpy as np
 from scipy.spatial import cKDTree

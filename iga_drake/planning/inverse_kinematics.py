@@ -48,7 +48,7 @@ class PoseSolver:
         return self.robot.pose(q)
 
     def is_valid(self, q: np.ndarray) -> bool:
-        """Whether `q` keeps the margins to the joints' limits and the safety distance."""
+        """True if `q` (rad) keeps the margins to the joints' limits and the safety distance."""
         distance = self.robot.safety_distance
         return bool(
             (q >= self._lower - 1e-9).all()
@@ -84,7 +84,7 @@ class PoseSolver:
         return None
 
     def is_reachable(self, X_WE: RigidTransform) -> bool:
-        """Whether `solve` finds an answer."""
+        """True if `solve` finds joint angles for the pose."""
         return self.solve(X_WE) is not None
 
     def _solve_from(

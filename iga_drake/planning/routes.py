@@ -112,7 +112,7 @@ class JointPath:
         return max(float(slowest), joint_time / _JOINT_SPEED_SHARE)
 
     def is_free(self) -> bool:
-        """Whether links keep the safety distance, less a hair, all along."""
+        """True if links keep the safety distance, less 1 mm, at every posture of the path."""
         for a, b in pairwise(self.postures):
             count = max(2, int(np.ceil(np.abs(b - a).max() / _JOINT_STEP)) + 1)
             for share in np.linspace(0.0, 1.0, count)[1:]:
@@ -154,7 +154,7 @@ def plan_path(
 
 
 def can_follow(robot: PlanningRobot, q: np.ndarray, path: LinePath) -> bool:
-    """Whether the arm at posture `q` (rad) can follow the line within limits, without jumps."""
+    """True if the arm at posture `q` (rad) can follow the line within limits, without jumps."""
     limits = robot.limits
     distance, angle = pose_error(path.X_WStart, path.X_WGoal)
     # A long way or a wide turn that brushes a joint's limit ends folded against it more often than

@@ -37,7 +37,7 @@ class Phase(Enum):
 
     @property
     def final(self) -> bool:
-        """Whether nothing more will happen."""
+        """True for a phase that no other follows."""
         return self in (Phase.DONE, Phase.REFUSED, Phase.FAILED)
 
 
