@@ -98,11 +98,11 @@ def benchmark_fusion(*, json: bool = False, repetitions: int = 15) -> dict:
         }
         for name, values in times.items()
     }
-    print(json_format.dumps(result) if json else table(result))
+    print(json_format.dumps(result) if json else _table(result))
     return result
 
 
-def table(result: dict) -> str:
+def _table(result: dict) -> str:
     """The figures of `benchmark_fusion` as text."""
     lines = [
         "Fusion of three depth images, 640x480, to clouds of 5 mm voxels",
