@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iga_drake.aligners.protocol import PoseEstimate
+from iga_drake.aligners.protocol import Aligner, PoseEstimate
 from iga_drake.demonstrations.alignment import Alignment
 
 
@@ -56,10 +56,16 @@ class Query:
         """The first arguments of `Aligner.align`."""
         return self.context, self.grasped, self.target
 
-    @property
-    def directions(self) -> dict[str, np.ndarray | None]:
-        """The keyword arguments of `Aligner.align` beside the seed."""
-        return {"grasped_up": self.grasped_up, "target_up": self.target_up}
+    def ask(self, aligner: Aligner, seed: int) -> PoseEstimate:
+        """The aligner's answer."""
+        return aligner.align(
+            self.context,
+            self.grasped,
+            self.target,
+            grasped_up=self.grasped_up,
+            target_up=self.target_up,
+            seed=seed,
+        )
 
     def motion(self, estimate: PoseEstimate) -> np.ndarray:
         """(4, 4) by which the best pose is off, of a cloud in its place: none where it is right."""
