@@ -211,6 +211,7 @@ def test_the_expert_steps_restarts_and_leaves_a_demonstration(scenario: Scenario
     assert demonstration.provenance.instances["target"].startswith("pan ")
     pan = demonstration.observations["pan"]
     np.testing.assert_array_equal(pan.points, result.observations["pan"].points)
+    assert pan.upright and not demonstration.observations["gripper"].upright
     # The trajectory passes the waypoint, and ends lifted.
     gaps = np.linalg.norm(demonstration.trajectory.X_WE[:, :3, 3] - reached.X_WE[:3, 3], axis=1)
     assert gaps.min() < 0.01 and gaps[-1] > 0.1

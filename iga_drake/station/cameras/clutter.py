@@ -24,8 +24,8 @@ class Clutter:
     ring: float = 0.0
     # Share of an object's pixels whose depth is wrong, in [0, 1).
     stray: float = 0.0
-    # Diameter (m) of the patches in which it is wrong, > 0. The fusion drops single pixels, and
-    # patches below some 2 cm.
+    # Diameter (m) of the patches in which it is wrong, > 0. The fusion drops single pixels and
+    # nearly all patches of 1 cm.
     patch: float = 0.03
     # Each patch is nearer or farther along its rays by a distance between 0 and this (m), > 0.
     spread: float = 0.3
