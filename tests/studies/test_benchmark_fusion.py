@@ -1,7 +1,7 @@
 import json
 
 from iga_drake import cli
-from iga_drake.studies.benchmark_fusion import table
+from iga_drake.studies.benchmark_fusion import _table
 
 
 def test_times_every_contender_in_one_run(capsys):
@@ -20,6 +20,6 @@ def test_times_every_contender_in_one_run(capsys):
         assert 0 < figures["min_ms"] <= figures["median_ms"] <= figures["max_ms"]
         if "whole" in name:  # all see the same surfaces; ours drops the pixels at jumps
             assert 0.9 < figures["points"] / ours["points"] < 1.1
-    lines = table(result).splitlines()
+    lines = _table(result).splitlines()
     assert len(lines) == 2 + len(result)
     assert all(any(line.startswith(name) for line in lines) for name in result)
