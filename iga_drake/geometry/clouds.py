@@ -1,8 +1,14 @@
-"""Point clouds: furthest point sampling (PyTorch, batched) and voxel grids (NumPy)."""
+"""Point clouds: furthest point sampling (PyTorch, batched), voxels and stray points (NumPy)."""
 
 import numpy as np
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from torch import Tensor
+
+STRAY = 3.0  # medians of the distance to the two nearest neighbours: the reach of a point
+CLUMP = 4  # points that belong to an object although they lie out of reach of the others
 
 
 def furthest_point_sampling(points: Tensor, count: int, start: Tensor | None = None) -> Tensor:
@@ -36,3 +42,41 @@ def voxel_indices(points: np.ndarray, size: float) -> np.ndarray:
     span = cells.max(0) + 1
     keys = (cells[:, 0] * span[1] + cells[:, 1]) * span[2] + cells[:, 2]
     return np.unique(keys, return_index=True)[1]
+
+
+def stray_points(points: np.ndarray) -> np.ndarray:
+    """Which points (P,) of a cloud (P, 3) are strays: bool.
+
+    A point is a stray where its two nearest neighbours are, in the mean, more than `STRAY` medians
+    of that distance away, or where it belongs to a clump of fewer than `CLUMP` points (fewer in
+    clouds of under 200) that is out of reach of all others. So thin parts stay, although their
+    points have few neighbours, and so do parts that were seen apart. Repeated points count once. A
+    cloud of which less than half would be left has no strays.
+    """
+    strays = _stray_points(points)
+    if strays is not None:
+        return strays
+    distinct, inverse = np.unique(points, axis=0, return_inverse=True)
+    strays = _stray_points(distinct)
+    assert strays is not None
+    return strays[inverse.ravel()]
+
+
+def _stray_points(points: np.ndarray) -> np.ndarray | None:
+    """`stray_points` of distinct points; None where some are repeated."""
+    P = len(points)
+    none = np.zeros(P, dtype=bool)
+    if P < 16:
+        return none
+    distance, neighbour = (each[:, 1:] for each in cKDTree(points).query(points, k=4))
+    if (distance[:, 0] == 0).any():
+        return None
+    nearest = distance[:, :2].mean(1)
+    reach = STRAY * np.median(nearest)
+    near = (distance <= reach) & (nearest <= reach)[:, None]
+    of = np.nonzero(near)
+    links = coo_array((np.ones(len(of[0])), (of[0], neighbour[of])), shape=(P, P))
+    _, label = connected_components(links, directed=False)
+    clump = np.bincount(label)[label]
+    strays = (nearest > reach) | (clump < min(CLUMP, P // 50))
+    return strays if 2 * strays.sum() < P else none
