@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from paper_networks import untrained
 
-from iga_drake.aligners.protocol import AlignerError, PoseEstimate
+from iga_drake.aligners.protocol import AlignerError, PoseEstimate, check_aligns
 from iga_drake.aligners.registry import aligner_names, make_aligner
 from iga_drake.demonstrations.alignment import Alignment, CloudError, check_cloud
 
@@ -56,3 +56,27 @@ def test_every_aligner_refuses_bad_input(name: str, tmp_path: Path) -> None:
         aligner.align(context, CLOUD[:2], CLOUD)
     with pytest.raises(CloudError, match="target"):
         aligner.align(context, CLOUD, np.full((40, 3), np.inf))
+
+
+@pytest.mark.parametrize("name", [name for name in aligner_names() if name not in PAPER])
+def test_ways_up_that_are_not_known_of_all_change_nothing(name: str) -> None:
+    aligner = make_aligner(name)
+    up = np.array([0.6, 0.0, 0.8])
+    plain, known = Alignment(CLOUD, CLOUD), Alignment(CLOUD, CLOUD, up, up)
+    expected = aligner.align((plain, plain), CLOUD, CLOUD)
+    for context, ups in (
+        ((known, known), {}),
+        ((plain, known), {"grasped_up": up, "target_up": up}),
+    ):
+        found = aligner.align(context, CLOUD, CLOUD, **ups)
+        np.testing.assert_array_equal(found.poses, expected.poses)
+
+
+def test_what_cannot_be_asked_as_the_protocol_says_is_refused() -> None:
+    class Old:
+        def align(self, context, grasped, target, *, seed=0): ...
+
+    for wrong in (Old(), object()):
+        with pytest.raises(AlignerError, match=r"aligner 'old': it can't be asked with align"):
+            check_aligns(wrong, "old")
+    check_aligns(make_aligner("icp"), "icp")

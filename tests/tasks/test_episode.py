@@ -35,7 +35,7 @@ class FixedAligner:
     X_WE: RigidTransform
     name: str = "fixed"
 
-    def align(self, context, grasped, target, *, seed=0):
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
         return PoseEstimate(self.X_WE.GetAsMatrix4()[None], np.zeros(1), np.ones(1))
 
 
@@ -148,7 +148,7 @@ class Unruly:
     def __init__(self, way):
         self.way = way
 
-    def align(self, context, grasped, target, *, seed=0):
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
         if self.way == "hangs":
             time.sleep(600.0)
         if self.way == "crashes":
