@@ -1,4 +1,4 @@
-"""Point clouds: furthest point sampling (PyTorch, batched), voxels and stray points (NumPy)."""
+"""Point clouds: samples and frames (PyTorch, batched), voxels and stray points (NumPy)."""
 
 import numpy as np
 import torch
@@ -33,6 +33,23 @@ def furthest_point_sampling(points: Tensor, count: int, start: Tensor | None = N
         distance = torch.minimum(distance, gap.square_().sum(1))
         index = distance.argmax(1)
     return chosen
+
+
+def own_frames(points: Tensor) -> Tensor:
+    """Rotations (B, 3, 3) whose columns are axes that turn with points (B, M, 3) about their
+    centroid: the first towards the point furthest from it, the second towards the one furthest
+    aside."""
+    far = points.square().sum(-1).argmax(-1)[:, None, None]
+    first = torch.nn.functional.normalize(points.take_along_dim(far, 1)[:, 0], dim=-1)
+    aside = points - (points @ first[..., None]) * first[:, None]
+    far = aside.square().sum(-1).argmax(-1)[:, None, None]
+    second = aside.take_along_dim(far, 1)[:, 0]
+    # Points on one line leave the second axis open.
+    straight = second.norm(dim=-1, keepdim=True) < 1e-9
+    spare = torch.eye(3).to(first)[first.abs().argmin(-1)]
+    spare = spare - (spare * first).sum(-1, keepdim=True) * first
+    second = torch.nn.functional.normalize(torch.where(straight, spare, second), dim=-1)
+    return torch.stack((first, second, torch.linalg.cross(first, second, dim=-1)), -1)
 
 
 def voxel_indices(points: np.ndarray, size: float) -> np.ndarray:

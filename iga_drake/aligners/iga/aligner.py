@@ -13,27 +13,28 @@ import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from iga_drake.aligners.iga.descriptor import DescriptorNet
+from iga_drake.aligners.iga.descriptor import Description, DescriptorNet
 from iga_drake.aligners.iga.energy import PairEnergyNet, SearchConfig, minimise, pair_proposals
 from iga_drake.aligners.iga.node_clouds import NodeClouds, beside_clutter, drawn_points
 from iga_drake.aligners.iga.voting import Match, VotingConfig, cast_votes, match_objects, modes
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate
 from iga_drake.checkpoint import file_digest, network_digest
-from iga_drake.demonstrations.alignment import Alignment, check_cloud
-from iga_drake.geometry.se3 import rigid
+from iga_drake.demonstrations.alignment import Alignment, check_cloud, check_direction
+from iga_drake.geometry.se3 import inverse
 from iga_drake.paths import models_dir
 
 LANDED = "landed"
 MINIMUM = 16  # distinct points that a cloud keeps
 STAGES = ("demonstrations", "describe", "match", "vote", "energy")  # of an inference
 TYPICAL_RADIUS = 0.065  # m, root-mean-square, of the objects that `VotingConfig`'s lengths are for
+Memory = tuple[tuple[Tensor, Tensor], ...]
 RANKINGS = ("vote", "energy")
 
 
@@ -71,12 +72,17 @@ class Explanation:
     voted: Tensor  # (n, 4, 4) modes of the vote, best first, X_WF
     index: Tensor  # (2, D + 1, M) which point of its cloud every node is
     logits: Tensor  # (2, D, M, M) of the test nodes' matches with the demonstrations' nodes
-    matches: tuple[list[Match], list[Match]]  # test nodes about their cloud's centroid
+    find_matches: Callable[[], tuple[list[Match], list[Match]]]  # see `matches`
     proposals: tuple[int, int, int]  # pairs of parts that vote, demonstrations, proposals of each
     energy: Callable[[Tensor], Tensor]  # of any poses X_WF (..., 4, 4); differentiable
     # From a pose X_WF (4, 4): (P, Q) shares of the pairs of parts, the first nodes of each.
     pair_weights: Callable[[Tensor], Tensor]
     seconds: dict[str, float]  # of each stage
+
+    @cached_property
+    def matches(self) -> tuple[list[Match], list[Match]]:
+        """Of both objects with every demonstration; test nodes about their cloud's centroid."""
+        return self.find_matches()
 
 
 @dataclass(frozen=True)
@@ -86,7 +92,7 @@ class _Described:
     clouds: NodeClouds
     descriptors: Tensor  # (B, M, D)
     weight: Tensor  # (B, M) probability that a node belongs to the object
-    memory: Any  # what the network needs to describe further clouds of the same objects
+    memory: Memory  # what the network needs to describe further clouds of the same objects
 
     @property
     def size(self) -> float:
@@ -172,12 +178,10 @@ class IgaAligner:
         grasped_up: np.ndarray | None = None,
         target_up: np.ndarray | None = None,
         seed: int = 0,
-        grasped_up: np.ndarray | None = None,
-        target_up: np.ndarray | None = None,
     ) -> PoseEstimate:
         """See `Aligner.align`."""
         return self.explain(
-            context, grasped, target, seed=seed, grasped_up=grasped_up, target_up=target_up
+            context, grasped, target, grasped_up=grasped_up, target_up=target_up, seed=seed
         ).estimate
 
     @torch.no_grad()
@@ -187,9 +191,9 @@ class IgaAligner:
         grasped: np.ndarray,
         target: np.ndarray,
         *,
-        seed: int = 0,
         grasped_up: np.ndarray | None = None,
         target_up: np.ndarray | None = None,
+        seed: int = 0,
         logits: Callable[[Tensor], Tensor] | None = None,
     ) -> Explanation:
         """The estimate of `align` with its intermediate results.
@@ -205,10 +209,16 @@ class IgaAligner:
         def stage() -> None:
             times.append(time.perf_counter())
 
-        shown = self._shown(context)
+        ups = [grasped_up, target_up]
+        for r, name in enumerate(("grasped_up", "target_up")):
+            if ups[r] is not None:
+                ups[r] = check_direction(ups[r], name)
+            if any(getattr(alignment, name) is None for alignment in context):
+                ups[r] = None
+        shown = self._shown(context, [up is not None for up in ups])
         stage()
         D = len(context)
-        test = self._described(test_clouds, (grasped_up, target_up), seed=seed, memory=shown.memory)
+        test = self._described(test_clouds, ups, seed=seed, memory=shown.memory)
         M = min(test.clouds.nodes.shape[1], shown.clouds.nodes.shape[1])
         stage()
         # Both roles: (2 D, ...), as the demonstrations' clouds are.
@@ -235,18 +245,17 @@ class IgaAligner:
             weights=(test.weight[role, :M], shown.weight[:, :M]),
             up=(test.clouds.up[role], shown.clouds.up),
         )
-        # A demonstration's two objects share one frame: they are put back into it.
-        matches = [
-            match.between(test.clouds.turned[r], X)
-            for match, r, X in zip(canonical, role.tolist(), shown.clouds.pose, strict=True)
+        # A demonstration's two objects share one frame: they are put back into it. The test objects
+        # stay in their own frames to the end.
+        same = torch.eye(4).to(shown.clouds.pose)
+        canonical = [
+            match.between(same, X) for match, X in zip(canonical, shown.clouds.pose, strict=True)
         ]
-        A, B = matches[:D], matches[D:]
+        A, B = canonical[:D], canonical[D:]
+        nodes_A, nodes_B = test.clouds.at_nodes[:, :M]
         stage()
-        centre_A, centre_B = centre = test.clouds.pose[:, :3, 3]
-        nodes = test.clouds.as_given[:, :M]
-        about = nodes - centre[:, None]
         voting = self.voting.scaled(shown.size / TYPICAL_RADIUS)
-        votes = cast_votes(A, B, about[0, : voting.parts], voting)
+        votes = cast_votes(A, B, nodes_A[: voting.parts], voting)
         X, energies = modes(votes)
         voted = X
         stage()
@@ -255,7 +264,7 @@ class IgaAligner:
         familiarity = None
         if self._energy is not None:
             prepared = self._energy(
-                pair_proposals(A, B, about[0], about[1], self._energy.config, self.voting)
+                pair_proposals(A, B, nodes_A, nodes_B, self._energy.config, self.voting)
             )
             if self.config.ranking == "energy":
                 X, energies = minimise(prepared, also=voted, config=self.search)
@@ -265,13 +274,20 @@ class IgaAligner:
         probability = (-(energies - energies.min())).softmax(0).numpy()
         keep = probability >= self.config.minimum_probability * probability.max()
 
-        def as_given(X: Tensor) -> Tensor:
-            R = X[..., :3, :3]
-            return rigid(R, X[..., :3, 3] + centre_B - R @ centre_A)
+        pose_A, pose_B = test.clouds.pose
 
-        def about_centroids(X: Tensor) -> Tensor:
-            R = X[..., :3, :3]
-            return rigid(R, X[..., :3, 3] - centre_B + R @ centre_A)
+        def as_given(X: Tensor) -> Tensor:
+            return pose_B @ X @ inverse(pose_A)
+
+        def in_own_frames(X: Tensor) -> Tensor:
+            return inverse(pose_B) @ X @ pose_A
+
+        def matches() -> tuple[list[Match], list[Match]]:
+            turned = [
+                match.between(test.clouds.turned[r], same)
+                for match, r in zip(canonical, role.tolist(), strict=True)
+            ]
+            return turned[:D], turned[D:]
 
         return Explanation(
             estimate=PoseEstimate(
@@ -280,38 +296,45 @@ class IgaAligner:
                 probability[keep] / probability[keep].sum(),
                 familiarity,
             ),
-            nodes=torch.cat((shown.clouds.as_given[:, :M].unflatten(0, (2, D)), nodes[:, None]), 1),
-            centres=centre,
+            nodes=torch.cat(
+                (
+                    shown.clouds.as_given[:, :M].unflatten(0, (2, D)),
+                    test.clouds.as_given[:, None, :M],
+                ),
+                1,
+            ),
+            centres=test.clouds.pose[:, :3, 3],
             voted=as_given(voted),
             index=index,
             logits=found,
-            matches=(A, B),
+            find_matches=matches,
             proposals=votes.proposals,
-            energy=lambda X: energy(about_centroids(X)),
-            pair_weights=lambda X: pair_weights(about_centroids(X)),
+            energy=lambda X: energy(in_own_frames(X)),
+            pair_weights=lambda X: pair_weights(in_own_frames(X)),
             seconds=dict(zip(STAGES, np.diff(times).tolist(), strict=True)),
         )
 
     def prepare(self, context: tuple[Alignment, ...]) -> None:
-        """Computes and keeps what depends on the demonstrations alone, so that `align` finds it."""
-        self._shown(context)
+        """Computes and keeps what depends on the demonstrations alone, so that `align` finds it;
+        ways up are taken to be known of the test objects where they are of all demonstrations."""
+        names = ("grasped_up", "target_up")
+        self._shown(context, [all(getattr(a, n) is not None for a in context) for n in names])
 
     @torch.no_grad()
-    def _shown(self, context: tuple[Alignment, ...]) -> "_Described":
+    def _shown(self, context: tuple[Alignment, ...], with_up: Sequence[bool]) -> "_Described":
+        """The demonstrations' clouds, the grasped objects' first: of this context, or remembered
+        of an equal one. `with_up` says for both whether their ways up count."""
+        clouds = [a.grasped for a in context] + [a.target for a in context]
+        ups = [a.grasped_up if with_up[0] else None for a in context]
+        ups += [a.target_up if with_up[1] else None for a in context]
         digest = hashlib.blake2b()
-        for alignment in context:
-            for array in (alignment.grasped, alignment.target):
-                digest.update(str(array.shape).encode())
-                digest.update(np.ascontiguousarray(array).data)
+        for array in (*clouds, *(np.zeros(0) if up is None else up for up in ups)):
+            digest.update(str(array.shape).encode())
+            digest.update(np.ascontiguousarray(array).data)
         key = digest.digest()
         shown = self._remembered.pop(key, None)
         if shown is None:
-            shown = self._described(
-                [a.grasped for a in context] + [a.target for a in context],
-                [None] * (2 * len(context)),
-                seed=0,
-                group=len(context),
-            )
+            shown = self._described(clouds, ups, seed=0, group=len(context))
         self._remembered[key] = shown  # the last one used comes last
         while len(self._remembered) > self.config.remembered:
             self._remembered.pop(next(iter(self._remembered)))
@@ -320,18 +343,19 @@ class IgaAligner:
     def _described(
         self,
         clouds: Sequence[np.ndarray],
-        up: Sequence[np.ndarray | None],
+        ups: Sequence[np.ndarray | None],
         *,
         seed: int,
         group: int = 1,
-        memory: Any = None,
+        memory: Memory | None = None,
     ) -> "_Described":
-        """Clouds (P, 3) with descriptors, `group` following each other of one object."""
+        """Clouds (P, 3) with descriptors, `group` following each other of one object, in the light
+        of the `memory` of other clouds of these objects."""
         config = self.config
         drawn = [
             drawn_points(cloud, config.points, guard=config.guard, seed=seed) for cloud in clouds
         ]
-        ready, found = self._describe(clouds, drawn, up, group, memory)
+        ready, found = self._describe(clouds, drawn, ups, group, memory)
         share = (found.presence < 0).double().mean(-1)
         if (share > config.clutter).any():
             beside = beside_clutter(ready, found.presence) & (share > config.clutter)[:, None]
@@ -339,7 +363,7 @@ class IgaAligner:
                 kept = some[~out[: len(some)]]
                 if len(np.unique(clouds[k][kept], axis=0)) >= MINIMUM:
                     drawn[k] = kept
-            ready, found = self._describe(clouds, drawn, up, group, memory)
+            ready, found = self._describe(clouds, drawn, ups, group, memory)
         # Nodes of something else come last: the first ones vote.
         order = (found.presence < 0).byte().argsort(dim=-1, stable=True)
         presence = found.presence.double().gather(1, order)
@@ -350,9 +374,16 @@ class IgaAligner:
             found.memory,
         )
 
-    def _describe(self, clouds, drawn, up, group, memory):
-        ready = NodeClouds.of(clouds, drawn, self.config.nodes, up)
-        found = self._net.describe(
+    def _describe(
+        self,
+        clouds: Sequence[np.ndarray],
+        drawn: Sequence[np.ndarray],
+        ups: Sequence[np.ndarray | None],
+        group: int,
+        memory: Memory | None,
+    ) -> tuple[NodeClouds, Description]:
+        ready = NodeClouds.of(clouds, drawn, self.config.nodes, ups)
+        found = self._net(
             ready.points.float(),
             ready.nodes,
             group=group,

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from iga_drake.geometry.clouds import furthest_point_sampling, stray_points
+from iga_drake.geometry.clouds import furthest_point_sampling, own_frames, stray_points
 from iga_drake.geometry.se3 import rigid, transform
 
 
@@ -68,27 +68,12 @@ class NodeClouds:
         if min(len(some) for some in drawn) < 2 * nodes:
             nodes = min(nodes, *(len(np.unique(cloud.numpy(), axis=0)) for cloud in given))
         chosen = furthest_point_sampling(points, nodes)
-        R = _own_frame(points.take_along_dim(chosen[..., None], 1))
+        R = own_frames(points.take_along_dim(chosen[..., None], 1))
         upward = torch.zeros(len(points), 3, dtype=torch.float64)
         for k, each in enumerate(up):
             if each is not None:
                 upward[k] = torch.from_numpy(np.asarray(each, dtype=np.float64)) @ R[k]
         return NodeClouds(points @ R, torch.from_numpy(index), chosen, rigid(R, centre), upward)
-
-
-def _own_frame(nodes: Tensor) -> Tensor:
-    """Rotations (B, 3, 3) whose columns are axes that turn with nodes (B, M, 3) about their
-    centroid: the first towards the first node, the second towards the one furthest aside."""
-    first = torch.nn.functional.normalize(nodes[:, 0], dim=-1)
-    aside = nodes - (nodes @ first[..., None]) * first[:, None]
-    best = aside.square().sum(-1).argmax(-1)
-    second = aside.take_along_dim(best[:, None, None], 1)[:, 0]
-    # Points on one line leave the second axis open.
-    straight = second.norm(dim=-1, keepdim=True) < 1e-9
-    spare = torch.eye(3).to(first)[first.abs().argmin(-1)]
-    spare = spare - (spare * first).sum(-1, keepdim=True) * first
-    second = torch.nn.functional.normalize(torch.where(straight, spare, second), dim=-1)
-    return torch.stack((first, second, torch.linalg.cross(first, second, dim=-1)), -1)
 
 
 def drawn_points(cloud: np.ndarray, count: int, *, guard: bool, seed: int) -> np.ndarray:

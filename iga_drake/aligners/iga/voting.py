@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from iga_drake.geometry.clouds import own_frames
 from iga_drake.geometry.se3 import (
     inverse,
     kabsch,
@@ -29,15 +30,15 @@ class VotingConfig:
     # Coarse hypotheses: random triplets drawn, scored, kept for refinement, and kept at the end.
     triplets: int = 384
     stretch: float = 2.0
-    scored: int = 384
-    refined: int = 8
+    scored: int = 128
+    refined: int = 6
     hypotheses: int = 6
     # The score counts so many nodes, and of each so many of the likeliest matches.
-    anchors: int = 40
-    likeliest: int = 24
+    anchors: int = 32
+    likeliest: int = 12
     # Whether the best one's half-turns about the principal axes are tried too.
     half_turns: bool = True
-    iterations: int = 4  # of refinement
+    iterations: int = 3  # of refinement
     # Where up is known: hypotheses that tilt it by more are dropped (if others are left), all count
     # less the more they do: exp(-(tilt / sigma_tilt)^2 / 2) in the vote. rad.
     tilt: float = math.radians(45)
@@ -62,10 +63,11 @@ class VotingConfig:
     # Residual of a part's rigid fit at which its weight has fallen to exp(-1/2).
     residual: float = 0.012
     # Hypothesis combinations of one demonstration, and of all together (the vote compares all with
-    # all); candidates in the final vote; modes returned.
+    # all); pairs of parts that vote; candidates in the final vote; modes returned.
     combinations: int = 16
     all_combinations: int = 64
-    pool: int = 1500
+    pairs: int = 400
+    pool: int = 600
     modes: int = 8
 
     def scaled(self, factor: float) -> "VotingConfig":
@@ -151,31 +153,18 @@ def _unit(points: Tensor, share: Tensor) -> Tensor:
     return points / (share * points.square().sum(-1)).sum(-1).sqrt()[:, None, None]
 
 
-def _homogeneous(x: Tensor, log_p: Tensor, y: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
-    """Matrices (..., S, 5) and (..., K, 5) whose product is log_p - |x - y|^2 / (2 sigma^2), of
-    points x (..., S, 3), y (..., K, 3) and log_p (..., K)."""
-    half_x = -0.5 * x.square().sum(-1, keepdim=True)
-    half_y = log_p[..., None] - 0.5 * y.square().sum(-1, keepdim=True) / sigma**2
-    one_x, one_y = torch.ones_like(half_x), torch.ones_like(half_y)
-    return torch.cat((x, half_x, one_x), -1), torch.cat(
-        (y / sigma**2, one_y / sigma**2, half_y), -1
-    )
+def _before(x: Tensor) -> Tensor:
+    """Rows (..., S, 5) of points x (..., S, 3); see `_after`."""
+    return torch.cat((x, -0.5 * x.square().sum(-1, keepdim=True), torch.ones_like(x[..., :1])), -1)
 
 
-def _likely(X: Tensor, x: Tensor, log_p: Tensor, y: Tensor, sigma: float) -> Tensor:
-    """(B, M, S, K) likelihoods of matches under motions X (B, S, 4, 4) of nodes x (B, M, 3): the
-    probability exp(log_p) (B, M, K) times the closeness to the points y (B, M, K, 3), at most 1."""
-    moved = transform(X, x[:, None]).transpose(1, 2)  # (B, M, S, 3)
-    a, b = _homogeneous(moved, log_p, y, sigma)
-    return (a @ b.mT).exp_()
-
-
-def _closeness(a: Tensor, b: Tensor) -> Tensor:
-    """exp(-|a_i - b_j|^2 / 2), (n, m), of points (n, k) and (m, k)."""
-    half_a, half_b = (-0.5 * each.square().sum(-1, keepdim=True) for each in (a, b))
-    one_a, one_b = torch.ones_like(half_a), torch.ones_like(half_b)
-    # Rounding may leave a little more than 1 where points coincide.
-    return (torch.cat((a, one_a, half_a), -1) @ torch.cat((b, half_b, one_b), -1).T).exp_()
+def _after(y: Tensor, sigma: float, log_p: Tensor | None = None) -> Tensor:
+    """Columns (..., 5, K) of points y (..., K, 3). The product of `_before(x)` with them is -|x -
+    y|^2 / (2 sigma^2), plus log_p (..., K) if given."""
+    half = y.square().sum(-1, keepdim=True) / (-2 * sigma**2)
+    if log_p is not None:
+        half = half + log_p[..., None]
+    return torch.cat((y / sigma**2, torch.full_like(half, sigma**-2), half), -1).mT
 
 
 def _log(x: Tensor) -> Tensor:
@@ -329,9 +318,10 @@ def global_hypotheses(
     # A few anchor nodes and their likeliest matches: the score needs no more, and this is costly.
     anchors = slice(0, min(M, config.anchors))
     likeliest, at = log_p[:, anchors].topk(min(N, config.likeliest), sorted=False)
-    near = y[objects, at]  # (B, A, K, 3)
+    near = _after(y[objects, at], config.coarse_sigma, likeliest)  # (B, A, 5, K)
+    moved = transform(X, x[:, None, anchors]).transpose(1, 2)  # (B, A, S, 3)
+    likely = (_before(moved) @ near).exp_().sum(-1)  # (B, A, S)
     weight = _shares(share_x[:, anchors])[..., None]
-    likely = _likely(X, x[:, anchors], likeliest, near, config.coarse_sigma).sum(-1)  # (B, A, S)
     tilt = _tilt(X[..., :3, :3], up)
     score = (_log(likely) * weight).sum(1) - config.tilt_penalty(tilt)
     wrong = ~sound.gather(1, first) | (tilt > config.tilt)
@@ -341,17 +331,23 @@ def global_hypotheses(
     if config.half_turns:
         turned = half_turns(y.double(), share_y.double()).to(X)
         X = torch.cat((X, rigid(turned @ X[:, :1, :3, :3], (turned @ X[:, :1, :3, 3:])[..., 0])), 1)
-    y = y[:, None].expand(-1, M, -1, -1)  # (B, M, N, 3)
-    with_one = torch.cat((y, torch.ones_like(y[..., :1])), -1)
+    with_one = torch.cat((y, torch.ones_like(y[..., :1])), -1)  # (B, N, 4)
+    columns, nodes = _after(y, config.coarse_sigma), x[:, None]
     S = X.shape[1]
+
+    def likely_matches() -> Tensor:  # (B, S M, N)
+        exponent = _before(transform(X, nodes).flatten(1, 2)) @ columns
+        exponent.view(B, S, M, N).add_(log_p[:, None])
+        return exponent.exp_()
+
     for _ in range(config.iterations):
-        sums = (_likely(X, x, log_p, y, config.coarse_sigma) @ with_one).transpose(1, 2)
+        sums = (likely_matches() @ with_one).view(B, S, M, 4)
         soft, likelihood = sums[..., :3] / sums[..., 3:].clamp_min(1e-37), _log(sums[..., 3])
         weight = (likelihood - likelihood.amax(-1, keepdim=True)).exp().clamp_min(1e-3).sqrt()
-        X = kabsch(x[:, None].expand(-1, S, -1, -1), soft, weight * share_x[:, None])
-    likely = _likely(X, x, log_p, y, config.coarse_sigma).sum(-1)
+        X = kabsch(nodes.expand(-1, S, -1, -1), soft, weight * share_x[:, None])
+    likely = likely_matches().sum(-1).view(B, S, M)
     tilt = _tilt(X[..., :3, :3], up)
-    score = (_log(likely) * share_x[..., None]).sum(1) - config.tilt_penalty(tilt)
+    score = (_log(likely) * share_x[:, None]).sum(-1) - config.tilt_penalty(tilt)
     score = score - 1e3 * (tilt > config.tilt)
     flat = X[..., :3, :3].flatten(2)
     same = (flat @ flat.mT >= 1 + 2 * math.cos(config.distinct)).tolist()  # by the trace
@@ -385,9 +381,19 @@ def match_objects(
     `weights` (B, M) and (B, N) in [0, 1] say how much the nodes count (default: all alike), `up`
     (B, 3) which way is up in the frames of the test and of the demonstration, zeros where unknown.
 
-    Works in single precision: frames matter to the last digits.
+    The objects are turned into frames of their own nodes first, so that single precision decides
+    alike whatever frames they come in.
     """
     B, M, N = logits.shape
+    poses, own = [], []
+    for nodes in (test, demonstration):
+        centre = nodes.mean(1)
+        frames = own_frames(nodes - centre[:, None])
+        poses.append(rigid(frames, centre))
+        own.append((nodes - centre[:, None]) @ frames)
+    if up is not None:
+        up = tuple((u.to(X)[:, None] @ X[:, :3, :3])[:, 0] for u, X in zip(up, poses, strict=True))
+    test, demonstration = own
     logits, x, y = logits.float(), test.float(), demonstration.float()
     if weights is None:
         shares = (x.new_full((B, M), 1 / M), x.new_full((B, N), 1 / N))
@@ -401,61 +407,63 @@ def match_objects(
     of = torch.arange(B, device=p.device).repeat_interleave(torch.tensor(counts).to(p.device))
     # From here on all hypotheses of all objects (H) in one batch.
     X = torch.cat([X for X, _ in hypotheses])
-    a, b = _homogeneous(
-        transform(X, unit_x[of]), p.new_zeros(B, N)[of], unit_y[of], config.match_sigma
-    )
-    assignment = p[of] * (a @ b.mT).exp_()
+    columns = _after(unit_y, config.match_sigma)
+    assignment = p[of] * (_before(transform(X, unit_x[of])) @ columns[of]).exp_()
     assignment = assignment / assignment.sum(-1, keepdim=True).clamp_min(1e-37)
-    soft = assignment @ y[of]  # (H, M, 3) in the demonstration's frame
+    soft = assignment.to(test) @ demonstration[of]  # (H, M, 3)
     parts = min(config.parts, M)
     count = max(6, round(config.neighbourhood * M))
-    distance, near = torch.cdist(x[:, :parts], x).topk(count, largest=False)
+    distance, near = torch.cdist(test[:, :parts], test).topk(count, largest=False)
     weight = torch.exp(-0.5 * (distance / distance[..., -1:]).square() * 2)  # (B, parts, count)
     objects = torch.arange(B, device=p.device)[:, None, None]
     weight = (weight * shares[0][objects, near])[of]
-    source = x[objects, near][of]  # (H, parts, count, 3)
+    source = test[objects, near][of]  # (H, parts, count, 3)
     goal = soft[torch.arange(len(soft))[:, None, None], near[of]]
     fit = kabsch(source, goal, weight)
     error = (transform(fit, source) - goal).square().sum(-1)
     residual = ((weight * error).sum(-1) / weight.sum(-1)).sqrt()
-    place = transform(fit, x[of, :parts, None])[..., 0, :]
-    result = (fit, place, residual, X[:, :3, :3], assignment)
-    split = (each.to(test.dtype).split(counts) for each in result)
+    place = transform(fit, test[of, :parts, None])[..., 0, :]
+    # Back into the frames that they came in.
+    before, after = inverse(poses[0])[of], poses[1][of]
+    R = after[:, :3, :3] @ X[:, :3, :3].to(test) @ before[:, :3, :3]
+    fit = after[:, None] @ fit @ before[:, None]
+    result = (fit, transform(after, place), residual, R, assignment.to(test))
+    split = (each.split(counts) for each in result)
     return [
-        Match(score.to(test.dtype), *each)
-        for (_, score), *each in zip(hypotheses, *split, strict=True)
+        Match(score.to(test), *each) for (_, score), *each in zip(hypotheses, *split, strict=True)
     ]
 
 
-def _combine(A: list[Match], B: list[Match], config: VotingConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """Proposals X (D, C, P, Q, 4, 4), log weights (D, C, P, Q) and distances of the parts."""
+def _combine(
+    A: list[Match], B: list[Match], config: VotingConfig
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Of C combinations of hypotheses in each demonstration: the motions of A's parts and those of
+    B's, inverted, (D, C, P or Q, 4, 4); log weights (D, C, P, Q) and distances of the parts."""
     most = max(2, min(config.combinations, config.all_combinations // len(A)))
-    poses, weights, gaps = [], [], []
+    chosen, priors = [], []
     for a, b in zip(A, B, strict=True):
         log_prior = (
             a.log_likelihood.sub(a.log_likelihood.max())[:, None]
             + b.log_likelihood.sub(b.log_likelihood.max())[None]
         ).flatten()
-        count = min(most, len(log_prior))
-        best = log_prior.topk(count).indices
+        best = log_prior.topk(min(most, len(log_prior))).indices
+        chosen.append(best)
+        priors.append(config.hypothesis * log_prior[best])
+    C = max(len(best) for best in chosen)
+    of_A, of_B, weights, gaps = [], [], [], []
+    for a, b, best, prior in zip(A, B, chosen, priors, strict=True):
+        padding = C - len(best)  # repeats the best one, without weight
+        best = torch.cat((best, best[:1].expand(padding)))
+        prior = torch.cat((prior, prior.new_full((padding,), -1e3)))
         i, j = best // len(b.log_likelihood), best % len(b.log_likelihood)
-        X = inverse(b.X_DT[j])[:, None] @ a.X_DT[i][:, :, None]  # (C, P, Q, 4, 4)
-        gap = torch.cdist(a.place[i], b.place[j])
-        quality = config.hypothesis * log_prior[best][:, None, None] - 0.5 * (
-            (a.residual[i] / config.residual).square()[:, :, None]
-            + (b.residual[j] / config.residual).square()[:, None]
-        )
-        padding = most - count
-        if padding:
-            X = torch.cat((X, X[:1].expand(padding, -1, -1, -1, -1)))
-            gap = torch.cat((gap, gap[:1].expand(padding, -1, -1)))
-            quality = torch.cat(
-                (quality, torch.full_like(quality[:1], -1e3).expand(padding, -1, -1))
-            )
-        poses.append(X)
-        weights.append(quality)
-        gaps.append(gap)
-    return torch.stack(poses), torch.stack(weights), torch.stack(gaps)
+        of_A.append(a.X_DT[i])
+        of_B.append(inverse(b.X_DT[j]))
+        gaps.append(torch.cdist(a.place[i], b.place[j]))
+        residual = (
+            a.residual[i].square()[:, :, None] + b.residual[j].square()[:, None]
+        ) / config.residual**2
+        weights.append(prior[:, None, None] - 0.5 * residual)
+    return torch.stack(of_A), torch.stack(of_B), torch.stack(weights), torch.stack(gaps)
 
 
 def vote(
@@ -470,34 +478,28 @@ def vote(
 
 def cast_votes(A: list[Match], B: list[Match], test_A: Tensor, config: VotingConfig) -> Votes:
     """The votes from which `vote` takes the modes; its arguments."""
-    X, log_w, gap = _combine(A, B, config)
+    of_A, of_B, log_w, gap = _combine(A, B, config)
     D, C, P, Q = log_w.shape
-    real = int((log_w[..., 0, 0] > -500).sum(1).max())
-    X, log_w, gap = X[:, :real], log_w[:, :real], gap[:, :real]
-    C = real
-    # The parts' own agreement: every proposal of a pair against all others of the same pair.
-    X = X.permute(2, 3, 0, 1, 4, 5).reshape(P * Q, D * C, 4, 4)
-    log_w = log_w.permute(2, 3, 0, 1).reshape(P * Q, D, C)
-    gap = gap.permute(2, 3, 0, 1).reshape(P * Q, D, C)
-    prior = -gap.amin(-1).mean(-1) / config.reach  # (PQ,)
-    keep = (prior + log_w.amax(-1).mean(-1)).topk(min(P * Q, 400)).indices
-    X, log_w, prior = X[keep], log_w[keep], prior[keep]
+    log_w, gap = (each.flatten(2).permute(2, 0, 1) for each in (log_w, gap))  # (P Q, D, C)
+    prior = -gap.amin(-1).mean(-1) / config.reach  # (P Q,)
+    keep = (prior + log_w.amax(-1).mean(-1)).topk(min(P * Q, config.pairs)).indices
+    log_w, prior = log_w[keep], prior[keep]
+    K = len(keep)
+    X = (of_B[:, :, keep % Q] @ of_A[:, :, keep // Q]).permute(2, 0, 1, 3, 4)
+    X = X.reshape(K, D * C, 4, 4)
     part = test_A[:P][keep // Q]  # (K, 3)
-    R = X[..., :3, :3]
-    place = transform(X, part[:, None, None].expand(-1, X.shape[1], 1, 3))[..., 0, :]
-    K = len(X)
-    flat, weights = R.flatten(2), log_w.exp()
+    place = transform(X, part[:, None, None].expand(-1, D * C, 1, 3))[..., 0, :]
+    # The parts' own agreement: every proposal of a pair against all others of the same pair.
+    at = _as_points(X[..., :3, :3], place, config).float()  # (K, D C, 12)
+    weights = log_w.exp().float()
     supports = []
     for d in range(D):  # one at a time: memory grows with D, not with its square
-        own = slice(d * C, (d + 1) * C)
-        chord2 = (3 - flat @ flat[:, own].transpose(1, 2)).clamp_min(0)
-        distance2 = (
-            chord2 / config.sigma_rotation**2
-            + (torch.cdist(place, place[:, own]) / config.sigma_translation).square()
-        )
-        supports.append(((-0.5 * distance2).exp() * weights[:, None, d]).max(-1))
+        own = at[:, d * C : (d + 1) * C]
+        close = (_before(at) @ _after(own, 1.0)).exp_()
+        supports.append((close * weights[:, None, d]).max(-1))
     best = torch.stack([support.values for support in supports], -1)  # (K, DC, D)
     which = torch.stack([support.indices for support in supports], -1)
+    best = best.to(prior)
     support = (best + 1e-3).log().sum(-1)  # (K, DC)
     total = support + prior[:, None] + log_w.reshape(K, D * C)
     top = total.flatten().topk(min(config.pool, K * D * C)).indices
@@ -519,20 +521,22 @@ def cast_votes(A: list[Match], B: list[Match], test_A: Tensor, config: VotingCon
     return Votes(candidates, weight, keep[k], (P, Q), at.mean(0), (K, D, C), config)
 
 
+def _as_points(R: Tensor, place: Tensor, config: VotingConfig) -> Tensor:
+    """(..., 12) poses as points whose squared distances are those of the votes' density, of
+    rotations (..., 3, 3), |R - S|^2 = 2 (3 - R.S), and places (..., 3)."""
+    turn = R.flatten(-2) / (math.sqrt(2) * config.sigma_rotation)
+    return torch.cat((turn, place / config.sigma_translation), -1)
+
+
 def modes(votes: Votes) -> tuple[Tensor, Tensor]:
     """Clusters weighted poses: kernel density, mean shift from the densest, non-maximum
     suppression. See `vote`."""
     X, log_weight, centre, config = votes.X, votes.log_weight, votes.centre, votes.config
-    # Poses as points whose squared distances are those of `_log_density`: |R - S|^2 = 2 (3 - R.S).
-    at = torch.cat(
-        (
-            X[:, :3, :3].flatten(1) / (math.sqrt(2) * config.sigma_rotation),
-            transform(X, centre[None])[:, 0] / config.sigma_translation,
-        ),
-        -1,
-    )  # (n, 12)
+    at = _as_points(X[:, :3, :3], transform(X, centre[None])[:, 0], config)  # (n, 12)
     weight = (log_weight - log_weight.max()).exp()
-    density = torch.cat([_closeness(some, at) @ weight for some in at.split(128)])
+    single, share = at.float(), weight.float()
+    columns = _after(single, 1.0)
+    density = torch.cat([(_before(some) @ columns).exp_() @ share for some in single.split(128)])
     alive = torch.ones(len(X), dtype=torch.bool)
     found: list[Tensor] = []
     energies: list[float] = []
