@@ -32,7 +32,7 @@ from iga_drake.paths import models_dir
 
 LANDED = "landed"
 MINIMUM = 16  # distinct points that a cloud keeps
-STAGES = ("demonstrations", "describe", "match", "vote", "energy")  # of an inference
+INFERENCE_STAGES = ("prepare", "describe", "match", "vote", "energy")  # the first: demonstrations
 TYPICAL_RADIUS = 0.065  # m, root-mean-square, of the objects that `VotingConfig`'s lengths are for
 Memory = tuple[tuple[Tensor, Tensor], ...]
 RANKINGS = ("vote", "energy")
@@ -311,7 +311,7 @@ class IgaAligner:
             proposals=votes.proposals,
             energy=lambda X: energy(in_own_frames(X)),
             pair_weights=lambda X: pair_weights(in_own_frames(X)),
-            seconds=dict(zip(STAGES, np.diff(times).tolist(), strict=True)),
+            seconds=dict(zip(INFERENCE_STAGES, np.diff(times).tolist(), strict=True)),
         )
 
     def prepare(self, context: tuple[Alignment, ...]) -> None:
