@@ -306,7 +306,7 @@ class IgaAligner:
             centres=test.clouds.pose[:, :3, 3],
             voted=as_given(voted),
             index=index,
-            logits=found,
+            logits=found.double(),
             find_matches=matches,
             proposals=votes.proposals,
             energy=lambda X: energy(in_own_frames(X)),
