@@ -55,8 +55,9 @@ class NodeClouds:
         nodes: int,
         up: Sequence[np.ndarray | None],
     ) -> "NodeClouds":
-        """Takes the points `drawn` of each cloud (P, 3), repeating those of smaller clouds, and as
-        many nodes as asked for, but no more than the smallest cloud has distinct points."""
+        """Takes the points `drawn` of each cloud (P, 3), distinct ones; those of smaller clouds are
+        repeated. Has as many nodes as asked for, but no more than the smallest cloud has points: a
+        node that is there twice would have no neighbourhood."""
         size = max(len(some) for some in drawn)
         index = np.stack([np.resize(some, size) for some in drawn])
         given = torch.from_numpy(
@@ -64,9 +65,7 @@ class NodeClouds:
         )
         centre = given.mean(1)
         points = given - centre[:, None]
-        # A node that is there twice has no neighbourhood: small clouds have fewer.
-        if min(len(some) for some in drawn) < 2 * nodes:
-            nodes = min(nodes, *(len(np.unique(cloud.numpy(), axis=0)) for cloud in given))
+        nodes = min(nodes, *(len(some) for some in drawn))
         chosen = furthest_point_sampling(points, nodes)
         R = own_frames(points.take_along_dim(chosen[..., None], 1))
         upward = torch.zeros(len(points), 3, dtype=torch.float64)
@@ -77,12 +76,13 @@ class NodeClouds:
 
 
 def drawn_points(cloud: np.ndarray, count: int, *, guard: bool, seed: int) -> np.ndarray:
-    """Indices of at most `count` points of a cloud (P, 3), drawn without repetition; with `guard`
-    without strays."""
+    """Indices of at most `count` distinct points of a cloud (P, 3), drawn where there are more;
+    with `guard` without strays."""
+    drawn = np.arange(len(cloud))
     if len(cloud) > count:
         drawn = np.random.default_rng(seed).permutation(len(cloud))[:count]
-    else:
-        drawn = np.arange(len(cloud))
+    rows = np.ascontiguousarray(cloud[drawn]).view(np.dtype((np.void, 3 * cloud.itemsize)))
+    drawn = drawn[np.sort(np.unique(rows, return_index=True)[1])]
     return drawn[~stray_points(cloud[drawn])] if guard else drawn
 
 
