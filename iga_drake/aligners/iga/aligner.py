@@ -34,6 +34,7 @@ LANDED = "landed"
 MINIMUM = 16  # distinct points that a cloud keeps
 INFERENCE_STAGES = ("prepare", "describe", "match", "vote", "energy")  # the first: demonstrations
 TYPICAL_RADIUS = 0.065  # m, root-mean-square, of the objects that `VotingConfig`'s lengths are for
+UPS = ("grasped_up", "target_up")
 Memory = tuple[tuple[Tensor, Tensor], ...]
 RANKINGS = ("vote", "energy")
 
@@ -99,6 +100,11 @@ class _Described:
         """m, geometric mean of both objects' root-mean-square radii."""
         of_role = self.clouds.radius.unflatten(0, (2, -1)).mean(-1)
         return float(of_role.log().mean().exp())
+
+
+def _known_ups(context: Sequence[Alignment]) -> list[bool]:
+    """Whether all demonstrations have the grasped and the target object's way up."""
+    return [all(getattr(alignment, name) is not None for alignment in context) for name in UPS]
 
 
 def default_weights() -> Path:
@@ -209,12 +215,12 @@ class IgaAligner:
         def stage() -> None:
             times.append(time.perf_counter())
 
-        ups = [grasped_up, target_up]
-        for r, name in enumerate(("grasped_up", "target_up")):
-            if ups[r] is not None:
-                ups[r] = check_direction(ups[r], name)
-            if any(getattr(alignment, name) is None for alignment in context):
-                ups[r] = None
+        # Ways up count where they are known of all clouds of an object.
+        demonstrated = _known_ups(context)
+        ups = [
+            check_direction(up, name) if up is not None and known else None
+            for up, name, known in zip((grasped_up, target_up), UPS, demonstrated, strict=True)
+        ]
         shown = self._shown(context, [up is not None for up in ups])
         stage()
         D = len(context)
@@ -317,8 +323,7 @@ class IgaAligner:
     def prepare(self, context: tuple[Alignment, ...]) -> None:
         """Computes and keeps what depends on the demonstrations alone, so that `align` finds it;
         ways up are taken to be known of the test objects where they are of all demonstrations."""
-        names = ("grasped_up", "target_up")
-        self._shown(context, [all(getattr(a, n) is not None for a in context) for n in names])
+        self._shown(context, _known_ups(context))
 
     @torch.no_grad()
     def _shown(self, context: tuple[Alignment, ...], with_up: Sequence[bool]) -> "_Described":

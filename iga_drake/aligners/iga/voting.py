@@ -19,6 +19,7 @@ from iga_drake.geometry.se3 import (
     kabsch,
     nearest_rotation,
     rigid,
+    so3_exp,
     transform,
 )
 
@@ -39,8 +40,8 @@ class VotingConfig:
     # Whether the best one's half-turns about the principal axes are tried too.
     half_turns: bool = True
     iterations: int = 3  # of refinement
-    # Where up is known: hypotheses that tilt it by more are dropped (if others are left), all count
-    # less the more they do: exp(-(tilt / sigma_tilt)^2 / 2) in the vote. rad.
+    # Where up is known: no hypothesis tilts it by more, and all count less the more they do:
+    # exp(-(tilt / sigma_tilt)^2 / 2) in the vote. rad.
     tilt: float = math.radians(45)
     sigma_tilt: float = math.radians(20)
     # Width of a geometric match, in units of the cloud's root-mean-square radius.
@@ -144,6 +145,11 @@ class Votes:
 def _shares(weight: Tensor) -> Tensor:
     """Weights (B, M) >= 0 of nodes, in shares of their sum."""
     return weight / weight.sum(-1, keepdim=True).clamp_min(1e-12)
+
+
+def _counting(share: Tensor) -> Tensor:
+    """Which nodes (B, M) count at least half as much as the first: bool, three of each at least."""
+    return share >= torch.minimum(share.amax(-1, keepdim=True) / 2, share.topk(3).values[:, -1:])
 
 
 def _unit(points: Tensor, share: Tensor) -> Tensor:
@@ -261,6 +267,19 @@ def _tilt(R: Tensor, up: tuple[Tensor, Tensor] | None) -> Tensor:
     return torch.acos(cosine) * known[:, None]
 
 
+def _upright(X: Tensor, up: tuple[Tensor, Tensor] | None, limit: float) -> Tensor:
+    """Motions (B, S, 4, 4), of those that tilt by more than the limit (rad) only so far; see
+    `_tilt`. The centroid's place stays."""
+    if up is None:
+        return X
+    R = X[..., :3, :3]
+    excess = (_tilt(R, up) - limit).clamp_min(0)
+    turned = (R @ up[0].to(R)[:, None, :, None])[..., 0]
+    axis = torch.linalg.cross(turned, up[1].to(R)[:, None].expand_as(turned), dim=-1)
+    back = so3_exp(nn.functional.normalize(axis, dim=-1) * excess[..., None])
+    return rigid(back @ R, X[..., :3, 3])
+
+
 def _unlike(X: Tensor, score: Tensor, count: int, angle: float) -> Tensor:
     """Indices (B, count) of motions (B, S, 4, 4), best score (B, S) first, whose rotations differ
     by at least an angle (rad) from those before, as long as there are such."""
@@ -300,9 +319,7 @@ def global_hypotheses(
     B, M, N = p.shape
     share_x, share_y = shares or (p.new_full((B, n), 1 / n) for n in (M, N))
     log_p = _log(p)
-    rows, columns = draw_triplets(
-        p, config.triplets, generator, share_x > 0.5 * share_x.amax(-1, keepdim=True)
-    )
+    rows, columns = draw_triplets(p, config.triplets, generator, _counting(share_x))
     objects = torch.arange(B, device=p.device)[:, None, None]
     source, goal = x[objects, rows], y[objects, columns]  # (B, T, 3, 3)
     # Slender triangles leave the rotation open, and a side that changed its length by more than
@@ -345,10 +362,10 @@ def global_hypotheses(
         soft, likelihood = sums[..., :3] / sums[..., 3:].clamp_min(1e-37), _log(sums[..., 3])
         weight = (likelihood - likelihood.amax(-1, keepdim=True)).exp().clamp_min(1e-3).sqrt()
         X = kabsch(nodes.expand(-1, S, -1, -1), soft, weight * share_x[:, None])
+        X = _upright(X, up, config.tilt)
     likely = likely_matches().sum(-1).view(B, S, M)
     tilt = _tilt(X[..., :3, :3], up)
     score = (_log(likely) * share_x[:, None]).sum(-1) - config.tilt_penalty(tilt)
-    score = score - 1e3 * (tilt > config.tilt)
     flat = X[..., :3, :3].flatten(2)
     same = (flat @ flat.mT >= 1 + 2 * math.cos(config.distinct)).tolist()  # by the trace
     close = (score >= score.amax(-1, keepdim=True) - config.margin).tolist()
@@ -392,13 +409,16 @@ def match_objects(
         poses.append(rigid(frames, centre))
         own.append((nodes - centre[:, None]) @ frames)
     if up is not None:
-        up = tuple((u.to(X)[:, None] @ X[:, :3, :3])[:, 0] for u, X in zip(up, poses, strict=True))
+        before, after = (
+            (each.to(X)[:, None] @ X[:, :3, :3])[:, 0] for each, X in zip(up, poses, strict=True)
+        )
+        up = before, after
     test, demonstration = own
     logits, x, y = logits.float(), test.float(), demonstration.float()
     if weights is None:
         shares = (x.new_full((B, M), 1 / M), x.new_full((B, N), 1 / N))
     else:
-        shares = tuple(_shares(each.float()) for each in weights)
+        shares = (_shares(weights[0].float()), _shares(weights[1].float()))
         logits = logits + _log(shares[1] / shares[1].amax(-1, keepdim=True))[:, None]
     unit_x, unit_y = _unit(x, shares[0]), _unit(y, shares[1])
     p = logits.softmax(-1)
@@ -421,13 +441,15 @@ def match_objects(
     goal = soft[torch.arange(len(soft))[:, None, None], near[of]]
     fit = kabsch(source, goal, weight)
     error = (transform(fit, source) - goal).square().sum(-1)
-    residual = ((weight * error).sum(-1) / weight.sum(-1)).sqrt()
+    residual = ((weight * error).sum(-1) / weight.sum(-1).clamp_min(1e-12)).sqrt()
+    # Parts about nodes that hardly count don't vote.
+    residual = residual + 10 * config.residual * ~_counting(shares[0])[of, :parts]
     place = transform(fit, test[of, :parts, None])[..., 0, :]
     # Back into the frames that they came in.
-    before, after = inverse(poses[0])[of], poses[1][of]
-    R = after[:, :3, :3] @ X[:, :3, :3].to(test) @ before[:, :3, :3]
-    fit = after[:, None] @ fit @ before[:, None]
-    result = (fit, transform(after, place), residual, R, assignment.to(test))
+    to_x, from_y = inverse(poses[0])[of], poses[1][of]
+    R = from_y[:, :3, :3] @ X[:, :3, :3].to(test) @ to_x[:, :3, :3]
+    fit = from_y[:, None] @ fit @ to_x[:, None]
+    result = (fit, transform(from_y, place), residual, R, assignment.to(test))
     split = (each.split(counts) for each in result)
     return [
         Match(score.to(test), *each) for (_, score), *each in zip(hypotheses, *split, strict=True)
