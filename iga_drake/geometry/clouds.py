@@ -7,7 +7,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-STRAY = 3.0  # medians of the distance to the two nearest neighbours: the reach of a point
+# Medians of the distance to the two nearest neighbours: the reach of a point, and that in clouds of
+# which more than a hundredth lies beyond it.
+REACH = 4.5
+REACH_AMONG_STRAYS = 3.0
 CLUMP = 4  # points that belong to an object although they lie out of reach of the others
 
 
@@ -64,11 +67,13 @@ def voxel_indices(points: np.ndarray, size: float) -> np.ndarray:
 def stray_points(points: np.ndarray) -> np.ndarray:
     """Which points (P,) of a cloud (P, 3) are strays: bool.
 
-    A point is a stray where its two nearest neighbours are, in the mean, more than `STRAY` medians
-    of that distance away, or where it belongs to a clump of fewer than `CLUMP` points (fewer in
-    clouds of under 200) that is out of reach of all others. So thin parts stay, although their
-    points have few neighbours, and so do parts that were seen apart. Repeated points count once. A
-    cloud of which less than half would be left has no strays.
+    A point is a stray where its two nearest neighbours are, in the mean, more than `REACH` medians
+    of that distance away. Where over a hundredth of the points are, the cloud is known to have
+    strays, and they are looked for more closely: the reach is `REACH_AMONG_STRAYS`, and a clump of
+    fewer than `CLUMP` points (fewer in clouds of under 200) that is out of reach of all others is
+    stray as well. So thin parts stay, although their points have few neighbours, and so do parts
+    that were seen apart. Repeated points count once. A cloud of which less than half would be left
+    has no strays.
     """
     strays = _stray_points(points)
     if strays is not None:
@@ -89,7 +94,11 @@ def _stray_points(points: np.ndarray) -> np.ndarray | None:
     if (distance[:, 0] == 0).any():
         return None
     nearest = distance[:, :2].mean(1)
-    reach = STRAY * np.median(nearest)
+    median = np.median(nearest)
+    strays = nearest > REACH * median
+    if strays.mean() <= 0.01:
+        return strays
+    reach = REACH_AMONG_STRAYS * median
     near = (distance <= reach) & (nearest <= reach)[:, None]
     of = np.nonzero(near)
     links = coo_array((np.ones(len(of[0])), (of[0], neighbour[of])), shape=(P, P))

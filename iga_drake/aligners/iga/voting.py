@@ -214,7 +214,7 @@ def fit_triangles(source: Tensor, goal: Tensor) -> Tensor:
     return rigid(R, to - (R @ middle[..., None])[..., 0])
 
 
-def half_turns(points: Tensor, share: Tensor) -> Tensor:
+def principal_half_turns(points: Tensor, share: Tensor) -> Tensor:
     """(B, 3, 3, 3) rotations by half a turn about the principal axes of clouds (B, N, 3), points
     about their centroid, of shares (B, N)."""
     _, axes = torch.linalg.eigh(points.mT @ (share[..., None] * points))
@@ -346,7 +346,7 @@ def global_hypotheses(
     best = _unlike(X, score, min(config.refined, some), config.distinct)
     X = X.take_along_dim(best[..., None, None], 1)
     if config.half_turns:
-        turned = half_turns(y.double(), share_y.double()).to(X)
+        turned = principal_half_turns(y.double(), share_y.double()).to(X)
         X = torch.cat((X, rigid(turned @ X[:, :1, :3, :3], (turned @ X[:, :1, :3, 3:])[..., 0])), 1)
     with_one = torch.cat((y, torch.ones_like(y[..., :1])), -1)  # (B, N, 4)
     columns, nodes = _after(y, config.coarse_sigma), x[:, None]

@@ -11,7 +11,7 @@ from iga_drake.aligners.iga.voting import (
     VotingConfig,
     draw_triplets,
     fit_triangles,
-    half_turns,
+    principal_half_turns,
     match_objects,
     vote,
 )
@@ -180,7 +180,7 @@ def test_half_turns_are_about_principal_axes() -> None:
     points = torch.randn(1, 200, 3, generator=torch.Generator().manual_seed(2)).double()
     points = points * torch.tensor([1.0, 2.0, 3.0])
     points = (points - points.mean(1)) @ _motion(3)[:3, :3].T
-    turns = half_turns(points, torch.full((1, 200), 1 / 200).double())[0]
+    turns = principal_half_turns(points, torch.full((1, 200), 1 / 200).double())[0]
     covariance = points[0].T @ points[0]
     for R in turns:
         torch.testing.assert_close(R @ R, torch.eye(3).double())
