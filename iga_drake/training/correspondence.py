@@ -10,6 +10,7 @@ inference chooses among hypotheses (`aligners/iga/voting.py`).
 Clutter: binary cross-entropy of the logits that a node lies on the object.
 """
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -76,7 +77,10 @@ class Draw:
     def split(self, samples: int) -> list["Draw"]:
         """The choices of so many samples after another."""
         parts = zip(*(t.split(samples) for t in (self.start, self.known, self.tilt)), strict=True)
-        return [Draw(self.demonstrations, *each, self.turns) for each in parts]
+        return [
+            dataclasses.replace(self, start=start, known=known, tilt=tilt)
+            for start, known, tilt in parts
+        ]
 
 
 def half_turns(canonical: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
@@ -255,7 +259,7 @@ def _motion_loss(
       random: (K, 3, 3) rotations.
       config: widths.
     """
-    B, D, M, _ = logits.shape
+    B, _, M, _ = logits.shape
     log_p = logits.log_softmax(-1)
     with torch.no_grad():
         x, y = (
