@@ -11,8 +11,8 @@ from iga_drake.aligners.iga.voting import (
     VotingConfig,
     draw_triplets,
     fit_triangles,
-    principal_half_turns,
     match_objects,
+    principal_half_turns,
     vote,
 )
 from iga_drake.dataset.samples import make_sample
