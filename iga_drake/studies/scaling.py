@@ -25,7 +25,7 @@ from iga_drake.viewing.figures import check_figure, new_figure, write_figure
 SCALING_SET = "diversity_medium"
 DIVERSITY_SETS = ("diversity_low", "diversity_medium", "diversity_high")
 DIVERSITY_NUMBERS = (1, 2, 4, 8, 15)
-STAGES = ("describe", "across", "match", "vote", "energy")
+STAGES = ("prepare", "describe", "across", "match", "vote", "energy")
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class Cost:
     across: int  # pairs of nodes of different clouds of one object, each layer
     proposals: int  # poses that pairs of parts propose
     comparisons: int  # of two proposals of the same pair
-    # Median time (s) of each of STAGES; "across" is the part of "describe" spent in attention
-    # between clouds.
+    # Median time (s) of each of STAGES; "prepare" describes the demonstrations, "across" is the
+    # part of both descriptions spent in attention between clouds.
     seconds: dict[str, float]
     total: float  # s, median
     memory: int  # bytes of tensors, peak over the largest of the samples measured
@@ -168,7 +168,9 @@ def measure_costs(
     result = []
     for n, some in rows.items():
         translation, rotation = np.array([error for _, _, error in some]).T
-        totals = [sum(s[stage] for stage in ("describe", "match", "vote")) for _, s, _ in some]
+        totals = [
+            sum(s[stage] for stage in ("prepare", "describe", "match", "vote")) for _, s, _ in some
+        ]
         result.append(
             Cost(
                 demonstrations=n,

@@ -6,6 +6,7 @@ import json
 import pytest
 
 from iga_drake import cli
+from iga_drake.aligners.iga.aligner import INFERENCE_STAGES
 from iga_drake.aligners.iga_paper.aligner import IgaPaperAligner, IgaPaperConfig
 from iga_drake.aligners.iga_paper.langevin import LangevinConfig
 from iga_drake.studies import benchmark_inference
@@ -25,3 +26,12 @@ def test_the_ratio_is_that_of_the_medians(peer: str, capsys, monkeypatch) -> Non
         assert 0 < row["min_s"] <= row["median_s"] <= row["max_s"]
     expected = result[peer]["median_s"] / result["iga"]["median_s"]
     assert result[f"ratio_{peer}_to_iga"] == pytest.approx(expected)
+
+
+def test_stages_are_those_of_an_inference_and_make_up_its_time(capsys) -> None:
+    options = ("--stages", "--count", "2", "--demonstrations", "2", "--json")
+    assert cli.main(["benchmark", "inference", *options]) == cli.SUCCESS
+    for row in json.loads(capsys.readouterr().out).values():
+        assert set(row) == {*INFERENCE_STAGES, "waypoint"}
+        spent = sum(row[name] for name in INFERENCE_STAGES[1:])
+        assert 0 < row["prepare"] and 0.5 * row["waypoint"] < spent < 1.1 * row["waypoint"]

@@ -1,30 +1,41 @@
 """The `iga` aligner: learned dense correspondence and consistency voting (variant `factorised`).
 
 Everything is invariant under separate rigid motions of the test clouds and of each demonstration,
-up to the choice of nodes, which furthest point sampling makes from the clouds' own geometry.
+up to the choice of nodes, which furthest point sampling makes from the clouds' own geometry: every
+cloud is turned into a frame of its own nodes first, so that single precision decides alike however
+the clouds lie.
+
+What depends on the demonstrations alone is computed once and kept.
 """
 
 import copy
+import hashlib
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from iga_drake.aligners.iga.descriptor import DescriptorNet
+from iga_drake.aligners.iga.descriptor import Description, DescriptorNet
 from iga_drake.aligners.iga.energy import PairEnergyNet, SearchConfig, minimise, pair_proposals
+from iga_drake.aligners.iga.node_clouds import NodeClouds, beside_clutter, drawn_points
 from iga_drake.aligners.iga.voting import Match, VotingConfig, cast_votes, match_objects, modes
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate
 from iga_drake.checkpoint import file_digest, network_digest
-from iga_drake.demonstrations.alignment import Alignment, check_cloud
-from iga_drake.geometry.clouds import furthest_point_sampling
-from iga_drake.geometry.se3 import rigid
+from iga_drake.demonstrations.alignment import Alignment, check_cloud, check_direction
+from iga_drake.geometry.se3 import inverse
 from iga_drake.paths import models_dir
 
 LANDED = "landed"
+MINIMUM = 16  # distinct points that a cloud keeps
+INFERENCE_STAGES = ("prepare", "describe", "match", "vote", "energy")  # the first: demonstrations
+TYPICAL_RADIUS = 0.065  # m, root-mean-square, of the objects that `VotingConfig`'s lengths are for
+UPS = ("grasped_up", "target_up")
+Memory = tuple[tuple[Tensor, Tensor], ...]
 RANKINGS = ("vote", "energy")
 
 
@@ -33,13 +44,20 @@ class IgaConfig:
     """Options of the aligner."""
 
     # Points of a cloud that are used (drawn without repetition where there are more).
-    points: int = 512
+    points: int = 1024
+    # Whether points far from all others are left out (`stray_points`).
+    guard: bool = True
+    # Share of a cloud's nodes that the network takes for something else, from which on their
+    # surroundings are left out and the rest of the cloud is described anew.
+    clutter: float = 0.1
     # Nodes with descriptors per object; at most the distinct points of the smallest cloud.
     nodes: int = 96
     # Places and ranks the poses: "vote" (its agreement), or "energy" (the learned one).
     ranking: str = "vote"
     # Modes below this share of the best one's probability are left out.
     minimum_probability: float = 0.01
+    # Sets of demonstrations whose descriptions are kept.
+    remembered: int = 16
 
 
 @dataclass(frozen=True)
@@ -55,12 +73,38 @@ class Explanation:
     voted: Tensor  # (n, 4, 4) modes of the vote, best first, X_WF
     index: Tensor  # (2, D + 1, M) which point of its cloud every node is
     logits: Tensor  # (2, D, M, M) of the test nodes' matches with the demonstrations' nodes
-    matches: tuple[list[Match], list[Match]]  # test nodes about their cloud's centroid
+    find_matches: Callable[[], tuple[list[Match], list[Match]]]  # see `matches`
     proposals: tuple[int, int, int]  # pairs of parts that vote, demonstrations, proposals of each
     energy: Callable[[Tensor], Tensor]  # of any poses X_WF (..., 4, 4); differentiable
     # From a pose X_WF (4, 4): (P, Q) shares of the pairs of parts, the first nodes of each.
     pair_weights: Callable[[Tensor], Tensor]
     seconds: dict[str, float]  # of each stage
+
+    @cached_property
+    def matches(self) -> tuple[list[Match], list[Match]]:
+        """Of both objects with every demonstration; test nodes about their cloud's centroid."""
+        return self.find_matches()
+
+
+@dataclass(frozen=True)
+class _Described:
+    """Clouds with the descriptors of their nodes."""
+
+    clouds: NodeClouds
+    descriptors: Tensor  # (B, M, D)
+    weight: Tensor  # (B, M) probability that a node belongs to the object
+    memory: Memory  # what the network needs to describe further clouds of the same objects
+
+    @property
+    def size(self) -> float:
+        """m, geometric mean of both objects' root-mean-square radii."""
+        of_role = self.clouds.radius.unflatten(0, (2, -1)).mean(-1)
+        return float(of_role.log().mean().exp())
+
+
+def _known_ups(context: Sequence[Alignment]) -> list[bool]:
+    """Whether all demonstrations have the grasped and the target object's way up."""
+    return [all(getattr(alignment, name) is not None for alignment in context) for name in UPS]
 
 
 def default_weights() -> Path:
@@ -113,9 +157,7 @@ class IgaAligner:
             digests.append(network_digest(energy))
         self.weights_digest = "+".join(digests)
         self._energy = copy.deepcopy(energy).eval().double() if energy is not None else None
-        # Double precision where it counts: choices between near ties must not depend on the clouds'
-        # frames.
-        self._net = copy.deepcopy(net).eval().mixed_precision()
+        self._net = copy.deepcopy(net).eval().float()
         self.config = config or IgaConfig()
         if self.config.ranking not in RANKINGS:
             raise AlignerError(
@@ -126,24 +168,12 @@ class IgaAligner:
         self.name = "iga" if self.config.ranking == "vote" else "iga-energy"
         self.voting = voting or VotingConfig()
         self.search = search or SearchConfig()
+        self._remembered: dict[bytes, _Described] = {}
 
     @property
     def net(self) -> DescriptorNet:
-        """The aligner's own copy of the network, in mixed precision."""
+        """The aligner's own copy of the network, in single precision."""
         return self._net
-
-    def _prepare(self, cloud: np.ndarray, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Points (P, 3) float64 about the cloud's centroid, that centroid (3,), and which points of
-        the cloud they are (P,)."""
-        rng = np.random.default_rng(seed)
-        count = self.config.points
-        if len(cloud) >= count:
-            drawn = rng.permutation(len(cloud))[:count]
-        else:
-            drawn = np.arange(count) % len(cloud)
-        points = torch.from_numpy(np.ascontiguousarray(cloud[drawn]))
-        centre = points.mean(0)
-        return points - centre, centre, torch.from_numpy(drawn)
 
     def align(
         self,
@@ -156,7 +186,9 @@ class IgaAligner:
         seed: int = 0,
     ) -> PoseEstimate:
         """See `Aligner.align`."""
-        return self.explain(context, grasped, target, seed=seed).estimate
+        return self.explain(
+            context, grasped, target, grasped_up=grasped_up, target_up=target_up, seed=seed
+        ).estimate
 
     @torch.no_grad()
     def explain(
@@ -165,6 +197,8 @@ class IgaAligner:
         grasped: np.ndarray,
         target: np.ndarray,
         *,
+        grasped_up: np.ndarray | None = None,
+        target_up: np.ndarray | None = None,
         seed: int = 0,
         logits: Callable[[Tensor], Tensor] | None = None,
     ) -> Explanation:
@@ -175,60 +209,91 @@ class IgaAligner:
         """
         if not context:
             raise AlignerError("iga: the context is empty: give at least one demonstration")
-        clouds = [a.grasped for a in context] + [check_cloud(grasped, "grasped")]
-        clouds += [a.target for a in context] + [check_cloud(target, "target")]
-        began = time.perf_counter()
-        half = len(clouds) // 2
-        points, centre, drawn = (
-            torch.stack(each)
-            for each in zip(*(self._prepare(cloud, seed) for cloud in clouds), strict=True)
+        test_clouds = [check_cloud(grasped, "grasped"), check_cloud(target, "target")]
+        times = [time.perf_counter()]
+
+        def stage() -> None:
+            times.append(time.perf_counter())
+
+        # Ways up count where they are known of all clouds of an object.
+        demonstrated = _known_ups(context)
+        ups = [
+            check_direction(up, name) if up is not None and known else None
+            for up, name, known in zip((grasped_up, target_up), UPS, demonstrated, strict=True)
+        ]
+        shown = self._shown(context, [up is not None for up in ups])
+        stage()
+        D = len(context)
+        test = self._described(test_clouds, ups, seed=seed, memory=shown.memory)
+        M = min(test.clouds.nodes.shape[1], shown.clouds.nodes.shape[1])
+        stage()
+        # Both roles: (2 D, ...), as the demonstrations' clouds are.
+        role = torch.arange(2).repeat_interleave(D)
+        index = torch.cat(
+            (
+                shown.clouds.node_index[:, :M].unflatten(0, (2, D)),
+                test.clouds.node_index[:, None, :M],
+            ),
+            1,
         )
-        # A node that is there twice has no neighbourhood: small clouds have fewer.
-        distinct = min(len(np.unique(cloud.numpy(), axis=0)) for cloud in points)
-        chosen = furthest_point_sampling(points, min(self.config.nodes, distinct))
-        nodes = torch.gather(points, 1, chosen[..., None].expand(-1, -1, 3))
-        index = torch.gather(drawn, 1, chosen).unflatten(0, (2, half))
-        found = logits(index) if logits else self._logits(points, chosen)
-        described = time.perf_counter()
-        generator = torch.Generator().manual_seed(seed)
-        # A demonstration's two objects share one frame: their centroids are put back.
-        goal = (nodes + centre[:, None]).unflatten(0, (2, half))
-        test = nodes[half - 1 :: half]  # (2, M, 3)
-        matches = match_objects(
+        if logits is None:
+            found = self._net.similarity(
+                test.descriptors[role, :M], shown.descriptors[:, :M]
+            ).unflatten(0, (2, D))
+        else:
+            found = logits(index)
+        canonical = match_objects(
             found.flatten(0, 1),
-            test.repeat_interleave(half - 1, 0),
-            goal[:, :-1].flatten(0, 1),
+            test.clouds.at_nodes[role, :M],
+            shown.clouds.at_nodes[:, :M],
             self.voting,
-            generator,
+            torch.Generator().manual_seed(seed),
+            weights=(test.weight[role, :M], shown.weight[:, :M]),
+            up=(test.clouds.up[role], shown.clouds.up),
         )
-        A, B = matches[: half - 1], matches[half - 1 :]
-        matched = time.perf_counter()
-        votes = cast_votes(A, B, test[0, : self.voting.parts], self.voting)
+        # A demonstration's two objects share one frame: they are put back into it. The test objects
+        # stay in their own frames to the end.
+        same = torch.eye(4).to(shown.clouds.pose)
+        canonical = [
+            match.between(same, X) for match, X in zip(canonical, shown.clouds.pose, strict=True)
+        ]
+        A, B = canonical[:D], canonical[D:]
+        nodes_A, nodes_B = test.clouds.at_nodes[:, :M]
+        stage()
+        voting = self.voting.scaled(shown.size / TYPICAL_RADIUS)
+        votes = cast_votes(A, B, nodes_A[: voting.parts], voting)
         X, energies = modes(votes)
-        voted, voted_at = X, time.perf_counter()
+        voted = X
+        stage()
         energy: Callable[[Tensor], Tensor] = votes.energy
         pair_weights: Callable[[Tensor], Tensor] = votes.pair_weights
         familiarity = None
         if self._energy is not None:
             prepared = self._energy(
-                pair_proposals(A, B, test[0], test[1], self._energy.config, self.voting)
+                pair_proposals(A, B, nodes_A, nodes_B, self._energy.config, self.voting)
             )
             if self.config.ranking == "energy":
                 X, energies = minimise(prepared, also=voted, config=self.search)
                 energy, pair_weights = prepared, prepared.pair_weights
             familiarity = float(self._energy.familiarity(prepared, X[0]))
-        ranked = time.perf_counter()
+        stage()
         probability = (-(energies - energies.min())).softmax(0).numpy()
         keep = probability >= self.config.minimum_probability * probability.max()
-        centre_A, centre_B = centre[half - 1 :: half]
+
+        pose_A, pose_B = test.clouds.pose
 
         def as_given(X: Tensor) -> Tensor:
-            R = X[..., :3, :3]
-            return rigid(R, X[..., :3, 3] + centre_B - R @ centre_A)
+            return pose_B @ X @ inverse(pose_A)
 
-        def about_centroids(X: Tensor) -> Tensor:
-            R = X[..., :3, :3]
-            return rigid(R, X[..., :3, 3] - centre_B + R @ centre_A)
+        def in_own_frames(X: Tensor) -> Tensor:
+            return inverse(pose_B) @ X @ pose_A
+
+        def matches() -> tuple[list[Match], list[Match]]:
+            turned = [
+                match.between(test.clouds.turned[r], same)
+                for match, r in zip(canonical, role.tolist(), strict=True)
+            ]
+            return turned[:D], turned[D:]
 
         return Explanation(
             estimate=PoseEstimate(
@@ -237,32 +302,97 @@ class IgaAligner:
                 probability[keep] / probability[keep].sum(),
                 familiarity,
             ),
-            nodes=goal,
-            centres=torch.stack((centre_A, centre_B)),
+            nodes=torch.cat(
+                (
+                    shown.clouds.as_given[:, :M].unflatten(0, (2, D)),
+                    test.clouds.as_given[:, None, :M],
+                ),
+                1,
+            ),
+            centres=test.clouds.pose[:, :3, 3],
             voted=as_given(voted),
             index=index,
-            logits=found,
-            matches=(A, B),
+            logits=found.double(),
+            find_matches=matches,
             proposals=votes.proposals,
-            energy=lambda X: energy(about_centroids(X)),
-            pair_weights=lambda X: pair_weights(about_centroids(X)),
-            seconds={
-                "describe": described - began,
-                "match": matched - described,
-                "vote": voted_at - matched,
-                "energy": ranked - voted_at,
-            },
+            energy=lambda X: energy(in_own_frames(X)),
+            pair_weights=lambda X: pair_weights(in_own_frames(X)),
+            seconds=dict(zip(INFERENCE_STAGES, np.diff(times).tolist(), strict=True)),
         )
 
-    def _logits(self, points: Tensor, chosen: Tensor) -> Tensor:
-        """(2, D, M, M) of the test nodes' matches, learned; clouds (2 (D + 1), P, 3)."""
-        half = len(points) // 2
-        points, chosen = points.unflatten(0, (2, half)), chosen.unflatten(0, (2, half))
-        shown = self._net(
-            points[:, :-1].flatten(0, 1), chosen[:, :-1].flatten(0, 1), group=half - 1
+    def prepare(self, context: tuple[Alignment, ...]) -> None:
+        """Computes and keeps what depends on the demonstrations alone, so that `align` finds it;
+        ways up are taken to be known of the test objects where they are of all demonstrations."""
+        self._shown(context, _known_ups(context))
+
+    @torch.no_grad()
+    def _shown(self, context: tuple[Alignment, ...], with_up: Sequence[bool]) -> "_Described":
+        """The demonstrations' clouds, the grasped objects' first: of this context, or remembered
+        of an equal one. `with_up` says for both whether their ways up count."""
+        clouds = [a.grasped for a in context] + [a.target for a in context]
+        ups = [a.grasped_up if with_up[0] else None for a in context]
+        ups += [a.target_up if with_up[1] else None for a in context]
+        digest = hashlib.blake2b()
+        for array in (*clouds, *(np.zeros(0) if up is None else up for up in ups)):
+            digest.update(str(array.shape).encode())
+            digest.update(np.ascontiguousarray(array).data)
+        key = digest.digest()
+        shown = self._remembered.pop(key, None)
+        if shown is None:
+            shown = self._described(clouds, ups, seed=0, group=len(context))
+        self._remembered[key] = shown  # the last one used comes last
+        while len(self._remembered) > self.config.remembered:
+            self._remembered.pop(next(iter(self._remembered)))
+        return shown
+
+    def _described(
+        self,
+        clouds: Sequence[np.ndarray],
+        ups: Sequence[np.ndarray | None],
+        *,
+        seed: int,
+        group: int = 1,
+        memory: Memory | None = None,
+    ) -> "_Described":
+        """Clouds (P, 3) with descriptors, `group` following each other of one object, in the light
+        of the `memory` of other clouds of these objects."""
+        config = self.config
+        drawn = [
+            drawn_points(cloud, config.points, guard=config.guard, seed=seed) for cloud in clouds
+        ]
+        ready, found = self._describe(clouds, drawn, ups, group, memory)
+        share = (found.presence < 0).double().mean(-1)
+        if (share > config.clutter).any():
+            beside = beside_clutter(ready, found.presence) & (share > config.clutter)[:, None]
+            for k, (some, out) in enumerate(zip(drawn, beside.numpy(), strict=True)):
+                kept = some[~out[: len(some)]]
+                if len(np.unique(clouds[k][kept], axis=0)) >= MINIMUM:
+                    drawn[k] = kept
+            ready, found = self._describe(clouds, drawn, ups, group, memory)
+        # Nodes of something else come last: the first ones vote.
+        order = (found.presence < 0).byte().argsort(dim=-1, stable=True)
+        presence = found.presence.double().gather(1, order)
+        return _Described(
+            replace(ready, nodes=ready.nodes.gather(1, order)),
+            found.descriptors.take_along_dim(order[..., None], 1),
+            presence.sigmoid(),
+            found.memory,
         )
-        test = self._net(points[:, -1], chosen[:, -1], memory=shown.memory)
-        return self._net.similarity(
-            test.descriptors.double()[:, None],
-            shown.descriptors.double().unflatten(0, (2, half - 1)),
+
+    def _describe(
+        self,
+        clouds: Sequence[np.ndarray],
+        drawn: Sequence[np.ndarray],
+        ups: Sequence[np.ndarray | None],
+        group: int,
+        memory: Memory | None,
+    ) -> tuple[NodeClouds, Description]:
+        ready = NodeClouds.of(clouds, drawn, self.config.nodes, ups)
+        found = self._net(
+            ready.points.float(),
+            ready.nodes,
+            group=group,
+            up=ready.up.float(),
+            memory=memory,
         )
+        return ready, found

@@ -160,7 +160,9 @@ def pair_proposals(
     """
     P = min(config.parts, A[0].X_DT.shape[1])
     Q = min(config.parts, B[0].X_DT.shape[1])
-    D, C = len(A), config.combinations
+    # No more combinations than some demonstration has: the others would weigh nothing.
+    most = max(len(a.log_likelihood) * len(b.log_likelihood) for a, b in zip(A, B, strict=True))
+    D, C = len(A), min(config.combinations, most)
     extents = (
         _extent(nodes_A, P, voting.neighbourhood) / 0.05,
         _extent(nodes_B, Q, voting.neighbourhood) / 0.05,

@@ -8,16 +8,18 @@ pairs whose proposals agree over the demonstrations are what the task is about.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from iga_drake.geometry.clouds import own_frames
 from iga_drake.geometry.se3 import (
     inverse,
     kabsch,
     nearest_rotation,
     rigid,
+    so3_exp,
     transform,
 )
 
@@ -26,11 +28,22 @@ from iga_drake.geometry.se3 import (
 class VotingConfig:
     """Scales of the vote. Lengths in metres unless said otherwise."""
 
-    # Coarse hypotheses: random triplets drawn, kept for refinement, and kept at the end.
+    # Coarse hypotheses: random triplets drawn, scored, kept for refinement, and kept at the end.
     triplets: int = 384
     stretch: float = 2.0
-    refined: int = 24
+    scored: int = 128
+    refined: int = 6
     hypotheses: int = 6
+    # The score counts so many nodes, and of each so many of the likeliest matches.
+    anchors: int = 32
+    likeliest: int = 12
+    # Whether the best one's half-turns about the principal axes are tried too.
+    half_turns: bool = True
+    iterations: int = 3  # of refinement
+    # Where up is known: no hypothesis tilts it by more, and all count less the more they do:
+    # exp(-(tilt / sigma_tilt)^2 / 2) in the vote. rad.
+    tilt: float = math.radians(45)
+    sigma_tilt: float = math.radians(20)
     # Width of a geometric match, in units of the cloud's root-mean-square radius.
     coarse_sigma: float = 0.35
     match_sigma: float = 0.45
@@ -51,11 +64,25 @@ class VotingConfig:
     # Residual of a part's rigid fit at which its weight has fallen to exp(-1/2).
     residual: float = 0.012
     # Hypothesis combinations of one demonstration, and of all together (the vote compares all with
-    # all); candidates in the final vote; modes returned.
+    # all); pairs of parts that vote; candidates in the final vote; modes returned.
     combinations: int = 16
     all_combinations: int = 64
-    pool: int = 1500
+    pairs: int = 400
+    pool: int = 600
     modes: int = 8
+
+    def scaled(self, factor: float) -> "VotingConfig":
+        """The same for objects that are `factor` times as large."""
+        return replace(
+            self,
+            sigma_translation=factor * self.sigma_translation,
+            reach=factor * self.reach,
+            residual=factor * self.residual,
+        )
+
+    def tilt_penalty(self, tilt: Tensor) -> Tensor:
+        """What a tilt (rad) takes from a hypothesis' mean log-likelihood."""
+        return 0.5 * (tilt / self.sigma_tilt).square() / self.hypothesis
 
 
 @dataclass(frozen=True)
@@ -68,6 +95,16 @@ class Match:
     residual: Tensor  # (H, parts) m
     R_DT: Tensor  # (H, 3, 3) the hypotheses themselves, coarse rotations of the whole object
     assignment: Tensor  # (H, M, N) probability of every match of test and demonstration nodes
+
+    def between(self, test: Tensor, demonstration: Tensor) -> "Match":
+        """The same match between other frames: motions (4, 4) from the test's and from the
+        demonstration's frame to them."""
+        return replace(
+            self,
+            X_DT=demonstration @ self.X_DT @ inverse(test),
+            place=transform(demonstration, self.place),
+            R_DT=demonstration[:3, :3] @ self.R_DT @ test[:3, :3].T,
+        )
 
 
 @dataclass(frozen=True)
@@ -105,50 +142,39 @@ class Votes:
         return torch.zeros(P * Q).to(share).index_add(0, self.pair, share).reshape(P, Q)
 
 
-def _unit(points: Tensor) -> Tensor:
-    """Clouds (B, M, 3) about their centroids in units of their root-mean-square radius."""
-    points = points - points.mean(1, keepdim=True)
-    return points / points.square().sum(-1, keepdim=True).mean(1, keepdim=True).sqrt()
+def _shares(weight: Tensor) -> Tensor:
+    """Weights (B, M) >= 0 of nodes, in shares of their sum."""
+    return weight / weight.sum(-1, keepdim=True).clamp_min(1e-12)
 
 
-def _closeness(a: Tensor, b: Tensor, sigma: float) -> Tensor:
-    """exp(-|a_i - b_j|^2 / (2 sigma^2)), (n, m), of points (n, k) and (m, k): one matrix product,
-    and the rest in its place. Quickest where n is the smaller."""
-    half_a, half_b = (-0.5 * each.square().sum(-1, keepdim=True) for each in (a, b))
-    one_a, one_b = torch.ones_like(half_a), torch.ones_like(half_b)
-    b = torch.cat((b, half_b, one_b), -1) / sigma**2
-    # Rounding may leave a little more than 1 where points coincide.
-    return (torch.cat((a, one_a, half_a), -1) @ b.T).exp_()
+def _counting(share: Tensor) -> Tensor:
+    """Which nodes (B, M) count at least half as much as the first: bool, three of each at least."""
+    return share >= torch.minimum(share.amax(-1, keepdim=True) / 2, share.topk(3).values[:, -1:])
+
+
+def _unit(points: Tensor, share: Tensor) -> Tensor:
+    """Clouds (B, M, 3) about their centroids in units of their root-mean-square radius; every point
+    counts with its share (B, M)."""
+    points = points - (share[..., None] * points).sum(1, keepdim=True)
+    return points / (share * points.square().sum(-1)).sum(-1).sqrt()[:, None, None]
+
+
+def _before(x: Tensor) -> Tensor:
+    """Rows (..., S, 5) of points x (..., S, 3); see `_after`."""
+    return torch.cat((x, -0.5 * x.square().sum(-1, keepdim=True), torch.ones_like(x[..., :1])), -1)
+
+
+def _after(y: Tensor, sigma: float, log_p: Tensor | None = None) -> Tensor:
+    """Columns (..., 5, K) of points y (..., K, 3). The product of `_before(x)` with them is -|x -
+    y|^2 / (2 sigma^2), plus log_p (..., K) if given."""
+    half = y.square().sum(-1, keepdim=True) / (-2 * sigma**2)
+    if log_p is not None:
+        half = half + log_p[..., None]
+    return torch.cat((y / sigma**2, torch.full_like(half, sigma**-2), half), -1).mT
 
 
 def _log(x: Tensor) -> Tensor:
-    return x.clamp_min(1e-300).log()
-
-
-def _sums(X: Tensor, value: Tensor, x: Tensor, y: Tensor, sigma: float) -> Tensor:
-    """(H, M, K) sums over y (N, 3) of value (M, N, K) times the closeness of y to x (M, 3), moved
-    by X (H, 4, 4)."""
-    moved = transform(X, x).transpose(0, 1)  # (M, H, 3)
-    H, N = len(X), len(y)
-    some = max(1, 2**18 // (H * N))  # nodes at a time, so that it all stays in the cache
-    result = [
-        v.mT @ _closeness(y, m.flatten(0, 1), sigma).view(N, -1, H).transpose(0, 1)
-        for v, m in zip(value.split(some), moved.split(some), strict=True)
-    ]  # (some, K, H)
-    return torch.cat(result).permute(2, 0, 1)
-
-
-def _soft_points(X: Tensor, p: Tensor, x: Tensor, y: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
-    """Soft matches (H, M, 3) and log-likelihoods (H, M) of nodes x (M, 3) moved by X (H, 4, 4) onto
-    y (N, 3), under probabilities p (M, N) of matches from descriptors alone."""
-    value = p[..., None] * torch.cat((y, torch.ones_like(y[:, :1])), -1)  # (M, N, 4)
-    total = _sums(X, value, x, y, sigma)
-    return total[..., :3] / total[..., 3:].clamp_min(1e-300), _log(total[..., 3])
-
-
-def _log_likelihood(X: Tensor, p: Tensor, x: Tensor, y: Tensor, sigma: float) -> Tensor:
-    """(H,) mean over nodes of the log-likelihoods of `_soft_points`."""
-    return _log(_sums(X, p[..., None], x, y, sigma)[..., 0]).mean(-1)
+    return x.clamp_min(torch.finfo(x.dtype).tiny).log()
 
 
 def _sides(triangle: Tensor) -> Tensor:
@@ -162,21 +188,64 @@ def _area(sides: Tensor) -> Tensor:
     return (half * (half[..., None] - sides).prod(-1)).clamp_min(0).sqrt()
 
 
-def draw_triplets(p: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def _on_plane(triangle: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Centroid (..., 3), frame (..., 3, 3) with the normal last, and coordinates (..., 3, 2) in it
+    of triangles (..., 3, 3)."""
+    middle = triangle.mean(-2)
+    along = triangle[..., 1, :] - triangle[..., 0, :]
+    normal = torch.linalg.cross(along, triangle[..., 2, :] - triangle[..., 0, :], dim=-1)
+    e1, e3 = (nn.functional.normalize(v, dim=-1) for v in (along, normal))
+    frame = torch.stack((e1, torch.linalg.cross(e3, e1, dim=-1), e3), -1)
+    return middle, frame, (triangle - middle[..., None, :]) @ frame[..., :2]
+
+
+def fit_triangles(source: Tensor, goal: Tensor) -> Tensor:
+    """The rigid motions (..., 4, 4) that best carry triangles (..., 3, 3) onto others: `kabsch` in
+    closed form. Planes go onto planes; in them the best turn of three points is known."""
+    middle, frame, u = _on_plane(source)
+    to, frame_to, v = _on_plane(goal)
+    covariance = v.mT @ u  # (..., 2, 2)
+    cosine = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
+    sine = covariance[..., 1, 0] - covariance[..., 0, 1]
+    cosine, sine = nn.functional.normalize(torch.stack((cosine, sine), -1), dim=-1).unbind(-1)
+    zero, one = torch.zeros_like(sine), torch.ones_like(sine)
+    turn = torch.stack((cosine, -sine, zero, sine, cosine, zero, zero, zero, one), -1)
+    R = frame_to @ turn.unflatten(-1, (3, 3)) @ frame.mT
+    return rigid(R, to - (R @ middle[..., None])[..., 0])
+
+
+def principal_half_turns(points: Tensor, share: Tensor) -> Tensor:
+    """(B, 3, 3, 3) rotations by half a turn about the principal axes of clouds (B, N, 3), points
+    about their centroid, of shares (B, N)."""
+    _, axes = torch.linalg.eigh(points.mT @ (share[..., None] * points))
+    outer = axes.mT[..., :, None] * axes.mT[..., None, :]
+    return 2 * outer - torch.eye(3).to(outer)
+
+
+def draw_triplets(
+    p: Tensor, count: int, generator: torch.Generator, drawn: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Draws `count` triplets of matched nodes for each of B objects.
 
     p (B, M, N) are probabilities of matches of test nodes with demonstration nodes. Returns indices
     (B, count, 3) of three different test nodes, and of the demonstration nodes drawn for them.
+    `drawn` (B, M) says which test nodes may be drawn, at least three of each object (default: all).
     """
     B, M, N = p.shape
+    if drawn is None:
+        drawn = torch.ones(B, M, dtype=torch.bool, device=p.device)
+    number = drawn.sum(-1, keepdim=True)  # (B, 1)
 
-    def below(n: int) -> Tensor:
-        return torch.randint(n, (B, count), generator=generator).to(p.device)
+    def below(n: Tensor) -> Tensor:
+        u = torch.rand(B, count, generator=generator, dtype=torch.float64).to(p.device)
+        return (u * n).long().minimum(n - 1)
 
-    first, gap = below(M), 1 + below(M - 1)
-    other = 1 + below(M - 2)
+    first, gap = below(number), 1 + below(number - 1)
+    other = 1 + below(number - 2)
     other = other + (other >= gap)
-    rows = torch.stack((first, first + gap, first + other), -1) % M
+    rank = torch.stack((first, first + gap, first + other), -1) % number[..., None]
+    order = (~drawn).byte().argsort(dim=-1, stable=True)  # those that may be drawn come first
+    rows = order.gather(1, rank.flatten(1)).view_as(rank)
     # All rows of p one after the other are one distribution function from 0 to B M.
     row = torch.arange(B)[:, None, None].to(p.device) * M + rows
     function = p.double().cumsum(-1)
@@ -186,60 +255,126 @@ def draw_triplets(p: Tensor, count: int, generator: torch.Generator) -> tuple[Te
     return rows, columns.clamp(0, N - 1)
 
 
+def _tilt(R: Tensor, up: tuple[Tensor, Tensor] | None) -> Tensor:
+    """(B, S) angles (rad) by which rotations (B, S, 3, 3) tilt the first up (B, 3) from the second;
+    0 where one of them is unknown (zeros)."""
+    if up is None:
+        return R.new_zeros(R.shape[:2])
+    before, after = (each.to(R) for each in up)
+    turned = (R @ before[:, None, :, None])[..., 0]
+    known = (before.square().sum(-1) > 0) & (after.square().sum(-1) > 0)
+    cosine = (turned * after[:, None]).sum(-1).clamp(-1, 1)
+    return torch.acos(cosine) * known[:, None]
+
+
+def _upright(X: Tensor, up: tuple[Tensor, Tensor] | None, limit: float) -> Tensor:
+    """Motions (B, S, 4, 4), of those that tilt by more than the limit (rad) only so far; see
+    `_tilt`. The centroid's place stays."""
+    if up is None:
+        return X
+    R = X[..., :3, :3]
+    excess = (_tilt(R, up) - limit).clamp_min(0)
+    turned = (R @ up[0].to(R)[:, None, :, None])[..., 0]
+    axis = torch.linalg.cross(turned, up[1].to(R)[:, None].expand_as(turned), dim=-1)
+    back = so3_exp(nn.functional.normalize(axis, dim=-1) * excess[..., None])
+    return rigid(back @ R, X[..., :3, 3])
+
+
+def _unlike(X: Tensor, score: Tensor, count: int, angle: float) -> Tensor:
+    """Indices (B, count) of motions (B, S, 4, 4), best score (B, S) first, whose rotations differ
+    by at least an angle (rad) from those before, as long as there are such."""
+    flat = X[..., :3, :3].flatten(2)
+    left, chosen = score.clone(), []
+    for _ in range(count):
+        best = left.argmax(-1, keepdim=True)  # (B, 1)
+        chosen.append(best)
+        trace = (flat * flat.gather(1, best[..., None].expand(-1, -1, 9))).sum(-1)
+        # What is like one that was taken comes after all that isn't, itself last.
+        left = left - 1e4 * (trace > 1 + 2 * math.cos(angle))
+        left.scatter_add_(1, best, torch.full_like(left[:, :1], -1e8))
+    return torch.cat(chosen, 1)
+
+
 def global_hypotheses(
-    p: Tensor, x: Tensor, y: Tensor, config: VotingConfig, generator: torch.Generator
+    p: Tensor,
+    x: Tensor,
+    y: Tensor,
+    config: VotingConfig,
+    generator: torch.Generator,
+    *,
+    shares: tuple[Tensor, Tensor] | None = None,
+    up: tuple[Tensor, Tensor] | None = None,
 ) -> list[tuple[Tensor, Tensor]]:
     """Coarse motions of test nodes onto demonstration nodes, for each of B objects.
 
     x (B, M, 3) are unit-scaled test nodes, y (B, N, 3) demonstration nodes, p (B, M, N)
-    probabilities of their matches. Returns for every object motions (H, 4, 4), best first, and
+    probabilities of their matches; shares (B, M) and (B, N) say how much every node counts; up (B,
+    3) of both, zeros where unknown. Returns for every object motions (H, 4, 4), best first, and
     their log-likelihoods (H,).
 
-    Triplets of matches drawn from the soft matching, fitted (Kabsch), scored by the likelihood of
-    all nodes under descriptors and geometry, refined by expectation maximisation.
+    Triplets of matches drawn from the soft matching, fitted, scored by the likelihood of the first
+    nodes under descriptors and geometry. The best that differ, and the best after half a turn about
+    each principal axis of the demonstration, are refined by expectation maximisation.
     """
-    B, M, _ = x.shape
-    rows, columns = draw_triplets(p, config.triplets, generator)
+    B, M, N = p.shape
+    share_x, share_y = shares or (p.new_full((B, n), 1 / n) for n in (M, N))
+    log_p = _log(p)
+    rows, columns = draw_triplets(p, config.triplets, generator, _counting(share_x))
     objects = torch.arange(B, device=p.device)[:, None, None]
     source, goal = x[objects, rows], y[objects, columns]  # (B, T, 3, 3)
     # Slender triangles leave the rotation open, and a side that changed its length by more than
     # `stretch` is no match.
     sides = [_sides(points) for points in (source, goal)]
     area = torch.minimum(*(_area(s) for s in sides))
-    ratio = (sides[1] / sides[0].clamp_min(1e-6)).clamp_min(1e-6).log().abs().amax(-1)
+    ratio = (sides[1].clamp_min(1e-6) / sides[0].clamp_min(1e-6)).log().abs().amax(-1)
     sound = (area > 0.03) & (ratio < math.log(config.stretch))
-    refined = min(config.refined, config.triplets)
-    scored = sound | (sound.sum(1, keepdim=True) < refined)  # the others only where they are needed
-    fitted = kabsch(source[scored], goal[scored]).split(scored.sum(1).tolist())
-    # Anchor nodes only: the score needs no more, and this is the costly part.
-    anchors = slice(0, min(M, 40))
-    best = []
-    for b, X in enumerate(fitted):
-        score = _log_likelihood(X, p[b, anchors], x[b, anchors], y[b], config.coarse_sigma)
-        score = score - 1e3 * ~sound[b, scored[b]]
-        best.append(X[score.topk(refined).indices])
-    X = torch.stack(best)  # (B, refined, 4, 4)
-    for _ in range(4):
-        soft, likelihood = (
-            torch.stack(each)
-            for each in zip(
-                *(_soft_points(X[b], p[b], x[b], y[b], config.coarse_sigma) for b in range(B)),
-                strict=True,
-            )
-        )
+    some = min(config.scored, config.triplets)
+    first = (~sound).byte().argsort(dim=-1, stable=True)[:, :some]
+    source, goal = (each.take_along_dim(first[..., None, None], 1) for each in (source, goal))
+    X = fit_triangles(source, goal)  # (B, S, 4, 4)
+    # A few anchor nodes and their likeliest matches: the score needs no more, and this is costly.
+    anchors = slice(0, min(M, config.anchors))
+    likeliest, at = log_p[:, anchors].topk(min(N, config.likeliest), sorted=False)
+    near = _after(y[objects, at], config.coarse_sigma, likeliest)  # (B, A, 5, K)
+    moved = transform(X, x[:, None, anchors]).transpose(1, 2)  # (B, A, S, 3)
+    likely = (_before(moved) @ near).exp_().sum(-1)  # (B, A, S)
+    weight = _shares(share_x[:, anchors])[..., None]
+    tilt = _tilt(X[..., :3, :3], up)
+    score = (_log(likely) * weight).sum(1) - config.tilt_penalty(tilt)
+    wrong = ~sound.gather(1, first) | (tilt > config.tilt)
+    score = (score - 1e3 * wrong).nan_to_num(-1e4)
+    best = _unlike(X, score, min(config.refined, some), config.distinct)
+    X = X.take_along_dim(best[..., None, None], 1)
+    if config.half_turns:
+        turned = principal_half_turns(y.double(), share_y.double()).to(X)
+        X = torch.cat((X, rigid(turned @ X[:, :1, :3, :3], (turned @ X[:, :1, :3, 3:])[..., 0])), 1)
+    with_one = torch.cat((y, torch.ones_like(y[..., :1])), -1)  # (B, N, 4)
+    columns, nodes = _after(y, config.coarse_sigma), x[:, None]
+    S = X.shape[1]
+
+    def likely_matches() -> Tensor:  # (B, S M, N)
+        exponent = _before(transform(X, nodes).flatten(1, 2)) @ columns
+        exponent.view(B, S, M, N).add_(log_p[:, None])
+        return exponent.exp_()
+
+    for _ in range(config.iterations):
+        sums = (likely_matches() @ with_one).view(B, S, M, 4)
+        soft, likelihood = sums[..., :3] / sums[..., 3:].clamp_min(1e-37), _log(sums[..., 3])
         weight = (likelihood - likelihood.amax(-1, keepdim=True)).exp().clamp_min(1e-3).sqrt()
-        X = kabsch(x[:, None].expand(soft.shape), soft, weight)
-    score = torch.stack(
-        [_log_likelihood(X[b], p[b], x[b], y[b], config.coarse_sigma) for b in range(B)]
-    )
+        X = kabsch(nodes.expand(-1, S, -1, -1), soft, weight * share_x[:, None])
+        X = _upright(X, up, config.tilt)
+    likely = likely_matches().sum(-1).view(B, S, M)
+    tilt = _tilt(X[..., :3, :3], up)
+    score = (_log(likely) * share_x[:, None]).sum(-1) - config.tilt_penalty(tilt)
     flat = X[..., :3, :3].flatten(2)
     same = (flat @ flat.mT >= 1 + 2 * math.cos(config.distinct)).tolist()  # by the trace
+    close = (score >= score.amax(-1, keepdim=True) - config.margin).tolist()
+    order = score.argsort(-1, descending=True).tolist()
     result = []
     for b in range(B):
         chosen: list[int] = []
-        close = (score[b] >= score[b].max() - config.margin).tolist()
-        for k in score[b].argsort(descending=True).tolist():
-            if len(chosen) == config.hypotheses or not close[k]:
+        for k in order[b]:
+            if len(chosen) == config.hypotheses or not close[b][k]:
                 break
             if not any(same[b][k][c] for c in chosen):
                 chosen.append(k)
@@ -253,72 +388,104 @@ def match_objects(
     demonstration: Tensor,
     config: VotingConfig,
     generator: torch.Generator,
+    *,
+    weights: tuple[Tensor, Tensor] | None = None,
+    up: tuple[Tensor, Tensor] | None = None,
 ) -> list[Match]:
     """Matches test nodes (B, M, 3) to demonstration nodes (B, N, 3) given logits (B, M, N), each of
-    B pairs of objects on its own; see `Match`."""
-    x, y = _unit(test), _unit(demonstration)
+    B pairs of objects on its own; see `Match`.
+
+    `weights` (B, M) and (B, N) in [0, 1] say how much the nodes count (default: all alike), `up`
+    (B, 3) which way is up in the frames of the test and of the demonstration, zeros where unknown.
+
+    The objects are turned into frames of their own nodes first, so that single precision decides
+    alike whatever frames they come in.
+    """
+    B, M, N = logits.shape
+    poses, own = [], []
+    for nodes in (test, demonstration):
+        centre = nodes.mean(1)
+        frames = own_frames(nodes - centre[:, None])
+        poses.append(rigid(frames, centre))
+        own.append((nodes - centre[:, None]) @ frames)
+    if up is not None:
+        before, after = (
+            (each.to(X)[:, None] @ X[:, :3, :3])[:, 0] for each, X in zip(up, poses, strict=True)
+        )
+        up = before, after
+    test, demonstration = own
+    logits, x, y = logits.float(), test.float(), demonstration.float()
+    if weights is None:
+        shares = (x.new_full((B, M), 1 / M), x.new_full((B, N), 1 / N))
+    else:
+        shares = (_shares(weights[0].float()), _shares(weights[1].float()))
+        logits = logits + _log(shares[1] / shares[1].amax(-1, keepdim=True))[:, None]
+    unit_x, unit_y = _unit(x, shares[0]), _unit(y, shares[1])
     p = logits.softmax(-1)
-    hypotheses = global_hypotheses(p, x, y, config, generator)
+    hypotheses = global_hypotheses(p, unit_x, unit_y, config, generator, shares=shares, up=up)
     counts = [len(score) for _, score in hypotheses]
-    of = torch.arange(len(p), device=p.device).repeat_interleave(torch.tensor(counts).to(p.device))
+    of = torch.arange(B, device=p.device).repeat_interleave(torch.tensor(counts).to(p.device))
     # From here on all hypotheses of all objects (H) in one batch.
-    R = torch.cat([X[:, :3, :3] for X, _ in hypotheses])
-    assignment = torch.cat(
-        [
-            p[b]
-            * _closeness(transform(X, x[b]).flatten(0, 1), y[b], config.match_sigma).view(
-                len(X), *p[b].shape
-            )
-            for b, (X, _) in enumerate(hypotheses)
-        ]
-    )
-    assignment = assignment / assignment.sum(-1, keepdim=True).clamp_min(1e-300)
-    soft = assignment @ demonstration[of]  # (H, M, 3) in the demonstration's frame
-    M = test.shape[1]
+    X = torch.cat([X for X, _ in hypotheses])
+    columns = _after(unit_y, config.match_sigma)
+    assignment = p[of] * (_before(transform(X, unit_x[of])) @ columns[of]).exp_()
+    assignment = assignment / assignment.sum(-1, keepdim=True).clamp_min(1e-37)
+    soft = assignment.to(test) @ demonstration[of]  # (H, M, 3)
     parts = min(config.parts, M)
     count = max(6, round(config.neighbourhood * M))
     distance, near = torch.cdist(test[:, :parts], test).topk(count, largest=False)
     weight = torch.exp(-0.5 * (distance / distance[..., -1:]).square() * 2)  # (B, parts, count)
-    source = test[torch.arange(len(test))[:, None, None], near][of]  # (H, parts, count, 3)
+    objects = torch.arange(B, device=p.device)[:, None, None]
+    weight = (weight * shares[0][objects, near])[of]
+    source = test[objects, near][of]  # (H, parts, count, 3)
     goal = soft[torch.arange(len(soft))[:, None, None], near[of]]
-    weight = weight[of]
     fit = kabsch(source, goal, weight)
     error = (transform(fit, source) - goal).square().sum(-1)
-    residual = ((weight * error).sum(-1) / weight.sum(-1)).sqrt()
+    residual = ((weight * error).sum(-1) / weight.sum(-1).clamp_min(1e-12)).sqrt()
+    # Parts about nodes that hardly count don't vote.
+    residual = residual + 10 * config.residual * ~_counting(shares[0])[of, :parts]
     place = transform(fit, test[of, :parts, None])[..., 0, :]
-    split = (each.split(counts) for each in (fit, place, residual, R, assignment))
-    return [Match(score, *each) for (_, score), *each in zip(hypotheses, *split, strict=True)]
+    # Back into the frames that they came in.
+    to_x, from_y = inverse(poses[0])[of], poses[1][of]
+    R = from_y[:, :3, :3] @ X[:, :3, :3].to(test) @ to_x[:, :3, :3]
+    fit = from_y[:, None] @ fit @ to_x[:, None]
+    result = (fit, transform(from_y, place), residual, R, assignment.to(test))
+    split = (each.split(counts) for each in result)
+    return [
+        Match(score.to(test), *each) for (_, score), *each in zip(hypotheses, *split, strict=True)
+    ]
 
 
-def _combine(A: list[Match], B: list[Match], config: VotingConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """Proposals X (D, C, P, Q, 4, 4), log weights (D, C, P, Q) and distances of the parts."""
+def _combine(
+    A: list[Match], B: list[Match], config: VotingConfig
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Of C combinations of hypotheses in each demonstration: the motions of A's parts and those of
+    B's, inverted, (D, C, P or Q, 4, 4); log weights (D, C, P, Q) and distances of the parts."""
     most = max(2, min(config.combinations, config.all_combinations // len(A)))
-    poses, weights, gaps = [], [], []
+    chosen, priors = [], []
     for a, b in zip(A, B, strict=True):
         log_prior = (
             a.log_likelihood.sub(a.log_likelihood.max())[:, None]
             + b.log_likelihood.sub(b.log_likelihood.max())[None]
         ).flatten()
-        count = min(most, len(log_prior))
-        best = log_prior.topk(count).indices
+        best = log_prior.topk(min(most, len(log_prior))).indices
+        chosen.append(best)
+        priors.append(config.hypothesis * log_prior[best])
+    C = max(len(best) for best in chosen)
+    of_A, of_B, weights, gaps = [], [], [], []
+    for a, b, best, prior in zip(A, B, chosen, priors, strict=True):
+        padding = C - len(best)  # repeats the best one, without weight
+        best = torch.cat((best, best[:1].expand(padding)))
+        prior = torch.cat((prior, prior.new_full((padding,), -1e3)))
         i, j = best // len(b.log_likelihood), best % len(b.log_likelihood)
-        X = inverse(b.X_DT[j])[:, None] @ a.X_DT[i][:, :, None]  # (C, P, Q, 4, 4)
-        gap = torch.cdist(a.place[i], b.place[j])
-        quality = config.hypothesis * log_prior[best][:, None, None] - 0.5 * (
-            (a.residual[i] / config.residual).square()[:, :, None]
-            + (b.residual[j] / config.residual).square()[:, None]
-        )
-        padding = most - count
-        if padding:
-            X = torch.cat((X, X[:1].expand(padding, -1, -1, -1, -1)))
-            gap = torch.cat((gap, gap[:1].expand(padding, -1, -1)))
-            quality = torch.cat(
-                (quality, torch.full_like(quality[:1], -1e3).expand(padding, -1, -1))
-            )
-        poses.append(X)
-        weights.append(quality)
-        gaps.append(gap)
-    return torch.stack(poses), torch.stack(weights), torch.stack(gaps)
+        of_A.append(a.X_DT[i])
+        of_B.append(inverse(b.X_DT[j]))
+        gaps.append(torch.cdist(a.place[i], b.place[j]))
+        residual = (
+            a.residual[i].square()[:, :, None] + b.residual[j].square()[:, None]
+        ) / config.residual**2
+        weights.append(prior[:, None, None] - 0.5 * residual)
+    return torch.stack(of_A), torch.stack(of_B), torch.stack(weights), torch.stack(gaps)
 
 
 def vote(
@@ -333,34 +500,28 @@ def vote(
 
 def cast_votes(A: list[Match], B: list[Match], test_A: Tensor, config: VotingConfig) -> Votes:
     """The votes from which `vote` takes the modes; its arguments."""
-    X, log_w, gap = _combine(A, B, config)
+    of_A, of_B, log_w, gap = _combine(A, B, config)
     D, C, P, Q = log_w.shape
-    real = int((log_w[..., 0, 0] > -500).sum(1).max())
-    X, log_w, gap = X[:, :real], log_w[:, :real], gap[:, :real]
-    C = real
-    # The parts' own agreement: every proposal of a pair against all others of the same pair.
-    X = X.permute(2, 3, 0, 1, 4, 5).reshape(P * Q, D * C, 4, 4)
-    log_w = log_w.permute(2, 3, 0, 1).reshape(P * Q, D, C)
-    gap = gap.permute(2, 3, 0, 1).reshape(P * Q, D, C)
-    prior = -gap.amin(-1).mean(-1) / config.reach  # (PQ,)
-    keep = (prior + log_w.amax(-1).mean(-1)).topk(min(P * Q, 400)).indices
-    X, log_w, prior = X[keep], log_w[keep], prior[keep]
+    log_w, gap = (each.flatten(2).permute(2, 0, 1) for each in (log_w, gap))  # (P Q, D, C)
+    prior = -gap.amin(-1).mean(-1) / config.reach  # (P Q,)
+    keep = (prior + log_w.amax(-1).mean(-1)).topk(min(P * Q, config.pairs)).indices
+    log_w, prior = log_w[keep], prior[keep]
+    K = len(keep)
+    X = (of_B[:, :, keep % Q] @ of_A[:, :, keep // Q]).permute(2, 0, 1, 3, 4)
+    X = X.reshape(K, D * C, 4, 4)
     part = test_A[:P][keep // Q]  # (K, 3)
-    R = X[..., :3, :3]
-    place = transform(X, part[:, None, None].expand(-1, X.shape[1], 1, 3))[..., 0, :]
-    K = len(X)
-    flat, weights = R.flatten(2), log_w.exp()
+    place = transform(X, part[:, None, None].expand(-1, D * C, 1, 3))[..., 0, :]
+    # The parts' own agreement: every proposal of a pair against all others of the same pair.
+    at = _as_points(X[..., :3, :3], place, config).float()  # (K, D C, 12)
+    weights = log_w.exp().float()
     supports = []
     for d in range(D):  # one at a time: memory grows with D, not with its square
-        own = slice(d * C, (d + 1) * C)
-        chord2 = (3 - flat @ flat[:, own].transpose(1, 2)).clamp_min(0)
-        distance2 = (
-            chord2 / config.sigma_rotation**2
-            + (torch.cdist(place, place[:, own]) / config.sigma_translation).square()
-        )
-        supports.append(((-0.5 * distance2).exp() * weights[:, None, d]).max(-1))
+        own = at[:, d * C : (d + 1) * C]
+        close = (_before(at) @ _after(own, 1.0)).exp_()
+        supports.append((close * weights[:, None, d]).max(-1))
     best = torch.stack([support.values for support in supports], -1)  # (K, DC, D)
     which = torch.stack([support.indices for support in supports], -1)
+    best = best.to(prior)
     support = (best + 1e-3).log().sum(-1)  # (K, DC)
     total = support + prior[:, None] + log_w.reshape(K, D * C)
     top = total.flatten().topk(min(config.pool, K * D * C)).indices
@@ -382,20 +543,22 @@ def cast_votes(A: list[Match], B: list[Match], test_A: Tensor, config: VotingCon
     return Votes(candidates, weight, keep[k], (P, Q), at.mean(0), (K, D, C), config)
 
 
+def _as_points(R: Tensor, place: Tensor, config: VotingConfig) -> Tensor:
+    """(..., 12) poses as points whose squared distances are those of the votes' density, of
+    rotations (..., 3, 3), |R - S|^2 = 2 (3 - R.S), and places (..., 3)."""
+    turn = R.flatten(-2) / (math.sqrt(2) * config.sigma_rotation)
+    return torch.cat((turn, place / config.sigma_translation), -1)
+
+
 def modes(votes: Votes) -> tuple[Tensor, Tensor]:
     """Clusters weighted poses: kernel density, mean shift from the densest, non-maximum
     suppression. See `vote`."""
     X, log_weight, centre, config = votes.X, votes.log_weight, votes.centre, votes.config
-    # Poses as points whose squared distances are those of `_log_density`: |R - S|^2 = 2 (3 - R.S).
-    at = torch.cat(
-        (
-            X[:, :3, :3].flatten(1) / (math.sqrt(2) * config.sigma_rotation),
-            transform(X, centre[None])[:, 0] / config.sigma_translation,
-        ),
-        -1,
-    )  # (n, 12)
+    at = _as_points(X[:, :3, :3], transform(X, centre[None])[:, 0], config)  # (n, 12)
     weight = (log_weight - log_weight.max()).exp()
-    density = torch.cat([_closeness(some, at, 1.0) @ weight for some in at.split(128)])
+    single, share = at.float(), weight.float()
+    columns = _after(single, 1.0)
+    density = torch.cat([(_before(some) @ columns).exp_() @ share for some in single.split(128)])
     alive = torch.ones(len(X), dtype=torch.bool)
     found: list[Tensor] = []
     energies: list[float] = []

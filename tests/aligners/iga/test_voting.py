@@ -7,10 +7,24 @@ import pytest
 import torch
 from torch import Tensor
 
-from iga_drake.aligners.iga.voting import VotingConfig, draw_triplets, match_objects, vote
+from iga_drake.aligners.iga.voting import (
+    VotingConfig,
+    draw_triplets,
+    fit_triangles,
+    match_objects,
+    principal_half_turns,
+    vote,
+)
 from iga_drake.dataset.samples import make_sample
 from iga_drake.geometry.clouds import furthest_point_sampling
-from iga_drake.geometry.se3 import geodesic_angle, inverse, random_rotations, rigid, transform
+from iga_drake.geometry.se3 import (
+    geodesic_angle,
+    inverse,
+    kabsch,
+    random_rotations,
+    rigid,
+    transform,
+)
 
 CONFIG = VotingConfig()
 
@@ -155,3 +169,106 @@ def test_surfaces_of_revolution_keep_axis_and_place_and_give_several_modes() -> 
         tilt = math.degrees(math.acos(min(1.0, float(pose[:3, :3] @ up @ up))))
         assert tilt < 12
         assert float((pose[:3, 3] - lift).norm()) < 0.015
+
+
+def test_triangles_are_fitted_as_by_kabsch() -> None:
+    source, goal = torch.randn(2, 50, 3, 3, generator=torch.Generator().manual_seed(7)).double()
+    torch.testing.assert_close(fit_triangles(source, goal), kabsch(source, goal))
+
+
+def test_half_turns_are_about_principal_axes() -> None:
+    points = torch.randn(1, 200, 3, generator=torch.Generator().manual_seed(2)).double()
+    points = points * torch.tensor([1.0, 2.0, 3.0])
+    points = (points - points.mean(1)) @ _motion(3)[:3, :3].T
+    turns = principal_half_turns(points, torch.full((1, 200), 1 / 200).double())[0]
+    covariance = points[0].T @ points[0]
+    for R in turns:
+        torch.testing.assert_close(R @ R, torch.eye(3).double())
+        assert float(torch.linalg.det(R)) == pytest.approx(1)
+        assert float(R.diagonal().sum()) == pytest.approx(-1)
+        torch.testing.assert_close(R @ covariance @ R.T, covariance)
+
+
+def _box(seed: int) -> Tensor:
+    """Points in a box that half a turn about any of its axes leaves as it is."""
+    corner = torch.rand(16, 3, generator=torch.Generator().manual_seed(seed)).double()
+    signs = torch.tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]).double()
+    return (signs[:, None] * corner * torch.tensor([0.1, 0.06, 0.03])).flatten(0, 1)
+
+
+def test_up_chooses_among_half_turns() -> None:
+    """Matches that know as little as the shape: a quarter of the weight on each of four nodes."""
+    box = _box(4)
+    index = torch.arange(16).repeat(4)
+    logits = (10.0 * (index[:, None] == index)).double()[None]
+    start = _motion(8)
+    test = transform(start, box)[None]
+    up = torch.tensor([[0.0, 0.6, 0.8]]).double()
+
+    def found(up_test: Tensor) -> Tensor:
+        generator = torch.Generator().manual_seed(0)
+        (match,) = match_objects(logits, test, box[None], CONFIG, generator, up=(up_test, up))
+        tilts = (match.R_DT @ up_test[0]) @ up[0]
+        best = match.R_DT[0] @ start[:3, :3]
+        return tilts, best
+
+    _, unknown = found(torch.zeros(1, 3).double())
+    assert float(unknown.abs().diagonal().sum()) == pytest.approx(3, abs=1e-3)  # one of the four
+    tilts, best = found(up @ start[:3, :3].T)
+    assert (tilts > math.cos(CONFIG.tilt) - 1e-4).all()
+    torch.testing.assert_close(best, torch.eye(3).double(), atol=1e-3, rtol=0)
+    # The other way up: another of the four.
+    turned = up * torch.tensor([-1.0, 1.0, -1.0])
+    tilts, best = found(turned @ start[:3, :3].T)
+    assert float((best @ turned[0]) @ up[0]) == pytest.approx(1, abs=1e-3)
+
+
+def test_nodes_without_weight_count_nothing() -> None:
+    """Half of the nodes of both objects are elsewhere, and match wrongly."""
+    generator = torch.Generator().manual_seed(6)
+    body = torch.randn(40, 3, generator=generator).double() * 0.05
+    rest = torch.randn(2, 40, 3, generator=generator).double() * 0.05 + 0.3
+    X = _motion(2)
+    test = torch.cat((body, rest[0]))[None]
+    shown = transform(X, torch.cat((body, rest[1])))[None]
+    order = torch.cat((torch.arange(40), 40 + torch.randperm(40, generator=generator)))
+    logits = 20.0 * (order[:, None] == torch.arange(80)).double()[None]
+    weight = (torch.arange(80) < 40).double()[None]
+    (match,) = match_objects(
+        logits, test, shown, CONFIG, torch.Generator().manual_seed(0), weights=(weight, weight)
+    )
+    torch.testing.assert_close(match.R_DT[0], X[:3, :3], atol=1e-3, rtol=0)
+    torch.testing.assert_close(match.X_DT[0], X.expand_as(match.X_DT[0]), atol=1e-3, rtol=0)
+
+
+def test_scaled_lengths_give_the_scaled_answer() -> None:
+    A, B, start = _cup(60, 1), _box(2) + 0.05, _motion(9)
+    frames = [_motion(k) for k in range(3)]
+    noise = [
+        0.003 * torch.randn(4, 64, 3, generator=torch.Generator().manual_seed(k)).double()
+        for k in range(2)
+    ]
+    As = [transform(X, A + noise[0][k, :60]) for k, X in enumerate(frames)] + [transform(start, A)]
+    Bs = [transform(X, B + noise[1][k]) for k, X in enumerate(frames)] + [B]
+
+    def solved(factor: float) -> tuple[Tensor, Tensor]:
+        matches = []
+        for clouds in (As, Bs):
+            n = len(clouds[0])
+            logits = 8 * torch.eye(n).double().expand(3, -1, -1)
+            matches.append(
+                match_objects(
+                    logits,
+                    factor * clouds[-1].expand(3, -1, -1),
+                    factor * torch.stack(clouds[:-1]),
+                    CONFIG,
+                    torch.Generator().manual_seed(0),
+                )
+            )
+        return vote(*matches, factor * As[-1], CONFIG.scaled(factor))
+
+    X, energy = solved(1.0)
+    scaled, again = solved(1.7)
+    torch.testing.assert_close(scaled[0, :3, :3], X[0, :3, :3], atol=1e-4, rtol=0)
+    torch.testing.assert_close(scaled[0, :3, 3], 1.7 * X[0, :3, 3], atol=1e-4, rtol=0)
+    torch.testing.assert_close(again[0], energy[0], atol=1e-3, rtol=0)
