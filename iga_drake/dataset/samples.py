@@ -8,8 +8,8 @@ canonical instance, in units of that instance's size.
 Frames: O, a shape's own; C, of the canonical pair (B as in its O); W, of one observed pair.
 """
 
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, field
+from functools import cache, cached_property
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from iga_drake.shapes.deformers import DeformableShape, Deformer, LatticeDeforme
 from iga_drake.shapes.families import FAMILIES
 from iga_drake.shapes.surfaces import Surface
 from iga_drake.shapes.symmetry import NO_SYMMETRY, Symmetry
+from iga_drake.shapes.symmetry_search import find_symmetries
 
 COMPOSITE = "composite"
 CAMERAS = 3
@@ -48,6 +49,8 @@ class SampleConfig:
     # and the share of the objects that are.
     meshes: str = ""
     mesh_share: float = 1.0
+    # Keep the test pair's surface, of which symmetries can be found.
+    test_surface: bool = False
 
 
 @dataclass(frozen=True)
@@ -68,11 +71,23 @@ class Sample:
     # about which its family is symmetric.
     axes: np.ndarray
     category: tuple[str, str]
+    # (2, S, 2, 3): of the test pair's A and B, in W: points of the surface (m) and unit normals;
+    # S = 0 unless the options say `test_surface`.
+    surface: np.ndarray = field(default_factory=lambda: np.empty((2, 0, 2, 3), np.float32))
 
     @property
     def symmetries(self) -> tuple[Symmetry, Symmetry]:
         """The symmetries of A's and B's families."""
         return _symmetry(self.category[0]), _symmetry(self.category[1])
+
+    @cached_property
+    def found_symmetries(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of the test pair's A and B, in W: motions (n, 4, 4) that carry the surface onto itself,
+        found in `surface`; the identity is the first, and the only one where there is none."""
+        if not self.surface.shape[1]:
+            return np.eye(4)[None], np.eye(4)[None]
+        A, B = (find_symmetries(*np.moveaxis(each, 1, 0)) for each in self.surface)
+        return A, B
 
 
 @dataclass(frozen=True)
@@ -408,6 +423,9 @@ def _observe(
     index = clouds.index.numpy().transpose(1, 0, 2)  # (2, N, P)
     canonical = [shape.points[0] / np.ptp(shape.points[0], axis=0).max() for shape in objects]
     test_A, test_B = poses[:, -1]
+    surface = np.stack((points[-1], normals[-1]), 2).astype(np.float32)
+    if not config.test_surface:
+        surface = surface[:, :0]
     return Sample(
         points=np.ascontiguousarray(clouds.points.numpy().transpose(1, 0, 2, 3), np.float32),
         canonical=np.stack([canonical[role][index[role]] for role in range(2)]).astype(np.float32),
@@ -417,6 +435,7 @@ def _observe(
         modes=_modes(alignments, int(mode[-1]), test_A, test_B),
         axes=np.stack([_move_axis(poses[role, -1], objects[role].axis) for role in range(2)]),
         category=(objects[0].category, objects[1].category),
+        surface=surface,
     )
 
 

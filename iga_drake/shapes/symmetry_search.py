@@ -220,7 +220,7 @@ class _SampledSurface:
         return bool((np.quantile(off, _SHARES) <= limits).all())
 
     def distances(self, motion: np.ndarray, chosen: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """How far (n,) m the chosen samples, moved (4, 4), lie from the surface; cut off far away."""
+        """How far (n,) m the chosen samples, moved (4, 4), lie from the surface, up to a limit."""
         far = 4 * self.tolerance + 2 * self.spacing
         indices = np.arange(len(self.points))[chosen]
         moved, nearest, known, _ = self._nearest(motion[None], indices, far, k=2)

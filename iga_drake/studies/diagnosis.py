@@ -13,13 +13,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from iga_drake.aligners.iga.aligner import Explanation, IgaAligner
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.aligners.query import Query
-from iga_drake.dataset.alignment_error import CONFIG, equivalents, nearest_error, random_pose
+from iga_drake.dataset.alignment_error import (
+    CONFIG,
+    equivalents,
+    known_symmetries,
+    nearest_error,
+    random_pose,
+)
 from iga_drake.dataset.oracle import oracle_pose
 from iga_drake.dataset.samples import Sample, make_sample
 from iga_drake.dataset.splits import sample_set
@@ -68,7 +73,7 @@ class Problem:
         return Problem(self.sample, query)
 
     def valid(self) -> np.ndarray:
-        """(n, 4, 4) right answers X_WF, those that differ by the families' symmetries too."""
+        """(n, 4, 4) right answers X_WF, those that differ by the objects' symmetries too."""
         return equivalents(self.sample, symmetry=True) @ np.linalg.inv(self.query.start)
 
     def error(self, X_WF: np.ndarray, *, symmetry: bool = True) -> tuple[float, float]:
@@ -84,7 +89,7 @@ class ObjectMatches:
     category: str
     # Angle (rad) of every coarse hypothesis from the true rotation, best hypothesis first.
     off: tuple[float, ...]
-    off_modulo: tuple[float, ...]  # the same modulo the family's symmetry
+    off_modulo: tuple[float, ...]  # the same modulo symmetry
     # Match errors over nodes, by the names of MATCHES: mean (m), mean and median as shares of the
     # object's size.
     error: dict[str, tuple[float, float, float]]
@@ -144,7 +149,7 @@ def hypothesis_errors(
     problem: Problem, explanation: Explanation, role: int, d: int
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Angles (rad) of the coarse hypotheses of an object from the true rotation between the test
-    and demonstration d; plain and modulo the family's symmetry."""
+    and demonstration d; plain and modulo symmetry."""
     sample = problem.sample
     size = sample.size[role, :, None, None]
     fit = kabsch(
@@ -155,8 +160,7 @@ def hypothesis_errors(
     found = explanation.matches[role][d].R_DT
     if role == 0:
         found = found @ torch.from_numpy(problem.query.start[:3, :3])
-    turns = sample.symmetries[role].angles()[:, None] * sample.axes[role, 1]
-    same = truth @ torch.from_numpy(Rotation.from_rotvec(turns).as_matrix())
+    same = truth @ torch.from_numpy(known_symmetries(sample)[role][:, :3, :3])
     off = geodesic_angle(found[:, None], same)
     return tuple(off[:, 0].tolist()), tuple(off.amin(1).tolist())
 

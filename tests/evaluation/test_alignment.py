@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from iga_drake.aligners.iga.aligner import default_weights
@@ -77,6 +78,25 @@ def test_any_of_the_modes_is_right() -> None:
     for motion in sample.modes:
         error = nearest_error(motion, equivalents(sample, symmetry=False), sample.points[0, -1])
         assert error == pytest.approx((0, 0), abs=1e-6)
+
+
+def test_errors_modulo_symmetry_forgive_what_turns_a_surface_into_itself() -> None:
+    """Of a composite whose surface is a cuboid: half-turns about its axes, no quarter-turns."""
+    sample = make_sample("unseen_instances", 0, replace(CONFIG, test_surface=False))
+    assert [len(found) for found in sample.found_symmetries] == [1, 1]
+    box = trimesh.creation.box((0.08, 0.12, 0.2))
+    points, faces = trimesh.sample.sample_surface(box, 2000, seed=0)
+    centre = np.array([0.3, -0.2, 0.1])
+    surface = np.stack((points + centre, box.face_normals[faces]), 1).astype(np.float32)
+    there = replace(
+        sample, category=("composite", "composite"), surface=np.stack((surface, surface))
+    )
+    valid, cloud = equivalents(there, symmetry=True), there.points[0, -1]
+    assert len(valid) == 16
+    for axis in np.eye(3):
+        error = nearest_error(_about(centre, np.pi * axis), valid, cloud)
+        assert error[0] < 0.002 and np.degrees(error[1]) < 1.5
+        assert nearest_error(_about(centre, np.pi / 2 * axis), valid, cloud)[1] > 1
 
 
 def test_errors_modulo_symmetry_forgive_the_family_s_own_turns_and_no_others() -> None:

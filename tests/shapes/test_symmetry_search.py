@@ -18,22 +18,30 @@ def _ellipsoid(*radii: float) -> trimesh.Trimesh:
     return trimesh.creation.icosphere(3).apply_transform(np.diag([*radii, 1]))
 
 
+def _both(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
+    return trimesh.util.concatenate(meshes)
+
+
+def _cylinder(radius: float, height: float, sections: int = 64) -> trimesh.Trimesh:
+    return trimesh.creation.cylinder(radius, height, sections=sections)
+
+
 SHAPES = {
     "cuboid": (_box(0.1, 0.15, 0.2), 4),
     "small cuboid": (_box(0.03, 0.05, 0.08), 4),
     "square bar": (_box(0.1, 0.1, 0.2), 8),
     "cube": (_box(0.12, 0.12, 0.12), 24),
-    "three-sided prism": (trimesh.creation.cylinder(0.06, 0.2, sections=3), 6),
-    "eight-sided plate": (trimesh.creation.cylinder(0.15, 0.05, sections=8), 16),
-    "cylinder": (trimesh.creation.cylinder(0.04, 0.2, sections=64), 2 * TURNS),
-    "cylinder of nearly equal moments": (trimesh.creation.cylinder(0.06, 0.12, sections=64), 2 * TURNS),
+    "three-sided prism": (_cylinder(0.06, 0.2, 3), 6),
+    "eight-sided plate": (_cylinder(0.15, 0.05, 8), 16),
+    "cylinder": (_cylinder(0.04, 0.2), 2 * TURNS),
+    "cylinder of nearly equal moments": (_cylinder(0.06, 0.12), 2 * TURNS),
     "cone": (trimesh.creation.cone(0.06, 0.2, sections=64), TURNS),
     "ellipsoid": (_ellipsoid(0.04, 0.06, 0.1), 4),
-    "T": (trimesh.util.concatenate([_box(0.04, 0.03, 0.2), _box(0.14, 0.03, 0.04, at=(0, 0, -0.08))]), 2),
-    "L": (trimesh.util.concatenate([_box(0.04, 0.04, 0.2), _box(0.12, 0.04, 0.04, at=(0.08, 0, -0.08))]), 1),
+    "T": (_both(_box(0.04, 0.03, 0.2), _box(0.14, 0.03, 0.04, at=(0, 0, -0.08))), 2),
+    "L": (_both(_box(0.04, 0.04, 0.2), _box(0.12, 0.04, 0.04, at=(0.08, 0, -0.08))), 1),
     # A bump of 12 mm on one face of a cuboid.
-    "marked cuboid": (trimesh.util.concatenate([_box(0.1, 0.15, 0.2), _box(0.03, 0.03, 0.024, at=(0.02, 0.05, 0.1))]), 1),
-}  # fmt: skip
+    "marked": (_both(_box(0.1, 0.15, 0.2), _box(0.03, 0.03, 0.024, at=(0.02, 0.05, 0.1))), 1),
+}
 
 
 def _posed(mesh: trimesh.Trimesh, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -81,7 +89,7 @@ def test_the_tolerance_is_a_length() -> None:
     for height, count in ((0.025, 1), (0.003, 4)):
         bar = _box(0.04, 0.06, 0.2)
         peg = _box(0.04, 0.03, 2 * height, at=(0, 0.015, 0.1))
-        points, normals, _ = _posed(trimesh.util.concatenate([bar, peg]), 0)
+        points, normals, _ = _posed(_both(bar, peg), 0)
         assert len(find_symmetries(points, normals)) == count
     assert len(find_symmetries(*_posed(_box(0.1, 0.104, 0.2), 0)[:2], tolerance=0.0005)) == 4
 
