@@ -5,8 +5,10 @@ centroid of the grasped cloud ends from where it belongs; rotation error: geodes
 demonstrations show several alignments, the nearest one counts. Two kinds of error are reported:
 
 - plain: against the alignments as generated;
-- modulo symmetry: where A's or B's family is (nearly) symmetric, against the nearest of the
-  alignments that are the same up to the symmetry.
+- modulo symmetry: where A or B is (nearly) symmetric, by its family or by chance, against the
+  nearest of the alignments that are the same up to the symmetry.
+
+An answer whose rotation is off by more than `FLIP` is a flip.
 """
 
 import time
@@ -37,6 +39,12 @@ FIVE_SETS = (
     "multi_modal",
 )
 THRESHOLDS = ((0.01, 5.0), (0.02, 10.0), (0.03, 15.0))  # m, deg
+FLIP = 45.0  # deg
+# Head of `Errors.columns`.
+COLUMNS = (
+    f"{'cm mean ± std (median)':<21}  {'deg mean ± std (median)':<20}  "
+    "% in 1 cm 5°, 2 cm 10°, 3 cm 15°, flips"
+)
 
 
 @dataclass(frozen=True)
@@ -67,6 +75,7 @@ class Errors:
     rotation_std: float
     rotation_median: float
     success: tuple[float, ...]  # share within each of THRESHOLDS
+    flips: float  # share off by more than FLIP
 
     @staticmethod
     def of(translation: np.ndarray, rotation: np.ndarray) -> "Errors":
@@ -80,6 +89,7 @@ class Errors:
             float(deg.std()),
             float(np.median(deg)),
             tuple(float(((cm <= 100 * m) & (deg <= d)).mean()) for m, d in THRESHOLDS),
+            float((deg > FLIP).mean()),
         )
 
     def columns(self) -> str:
@@ -89,7 +99,7 @@ class Errors:
             f"{self.translation_mean:5.2f} ± {self.translation_std:5.2f} "
             f"({self.translation_median:5.2f})  "
             f"{self.rotation_mean:5.1f} ± {self.rotation_std:4.1f} ({self.rotation_median:5.1f})  "
-            f"{rates}"
+            f"{rates}  {100 * self.flips:5.1f}"
         )
 
 
@@ -115,10 +125,7 @@ class AlignmentErrors:
         )
 
 
-HEADER = (
-    f"{'aligner':<8} {'set':<18} {'count':>5}  {'error':<6}  {'cm mean ± std (median)':<21}  "
-    f"{'deg mean ± std (median)':<20}  % in 1 cm 5°, 2 cm 10°, 3 cm 15°   s"
-)
+HEADER = f"{'aligner':<8} {'set':<18} {'count':>5}  {'error':<6}  {COLUMNS}   s"
 
 
 def evaluate_sample(aligner: Aligner | None, split: str, index: int) -> SampleErrors | None:
@@ -221,12 +228,12 @@ def by_category(rows: Iterable[SampleErrors]) -> str:
     for row in rows:
         for category in {row.grasped, row.target}:
             table.setdefault(category, []).append((row.translation_modulo, row.rotation_modulo))
-    lines = [f"{'category':<16} {'count':>5}  cm mean (median)  deg mean (median)"]
+    lines = [f"{'category':<16} {'count':>5}  cm mean (median)  deg mean (median)  flips %"]
     for category, values in sorted(table.items(), key=lambda item: -np.mean(item[1], 0)[1]):
         cm, deg = np.array(values).T * [[100.0], [180 / np.pi]]
         lines.append(
             f"{category:<16} {len(values):>5}  {cm.mean():5.2f} ({np.median(cm):5.2f})     "
-            f"{deg.mean():5.1f} ({np.median(deg):5.1f})"
+            f"{deg.mean():5.1f} ({np.median(deg):5.1f})     {100 * np.mean(deg > FLIP):5.1f}"
         )
     return "\n".join(lines)
 

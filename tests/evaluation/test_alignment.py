@@ -20,7 +20,7 @@ from iga_drake.dataset.alignment_error import (
 )
 from iga_drake.dataset.samples import make_sample
 from iga_drake.errors import IgaDrakeError
-from iga_drake.evaluation.alignment import by_category, evaluate_alignment, model_card
+from iga_drake.evaluation.alignment import Errors, by_category, evaluate_alignment, model_card
 from iga_drake.evaluation.results import ResultsStore
 from iga_drake.shapes.families import FAMILIES
 
@@ -71,6 +71,14 @@ def test_the_truth_has_no_error_and_an_offset_shows() -> None:
     assert row.plain.translation_mean == pytest.approx(1.5)
     assert row.plain.success == (0.0, 1.0, 1.0) and "1.50" in row.rows()
     assert [r.translation for r in rows] == pytest.approx([0.015] * 3)
+
+
+def test_answers_off_by_over_45_degrees_are_flips() -> None:
+    errors = Errors.of(np.zeros(4), np.radians([0.0, 44.0, 46.0, 180.0]))
+    assert errors.flips == 0.5 and errors.columns().endswith("50.0")
+    turn = _about(np.zeros(3), np.array([0.0, 0.0, 2.0]))
+    row, rows = evaluate_alignment(_Fixed(turn), "validation", 2)
+    assert row.plain.flips == 1.0 and "flips" in by_category(rows)
 
 
 def test_any_of_the_modes_is_right() -> None:
