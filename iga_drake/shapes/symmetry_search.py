@@ -6,7 +6,7 @@ far the moved surface lies from itself.
 The tolerance is what two clouds of one patch of surface may differ by. A cloud has a point per 5 mm
 with an error of 1.3 mm, which averages out over a few points; what stays is the error of the
 cameras' places, 2 mm along each axis, twice. So a rotation is accepted where 95 % of the moved
-surface lie within 4 mm of the surface and 99 % within twice that: a feature of a hundredth of the
+surface lie within 4 mm of the surface and 99.5 % within twice that: a feature of a hundredth of the
 surface (five points of a cloud of 512) that lies 8 mm elsewhere tells the poses apart.
 """
 
@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 TOLERANCE = 0.004  # m
 ORDERS = (2, 3, 4, 5, 6, 7, 8, 0)  # of the axes that are looked for; 0: any angle
 TURNS = 72  # that stand for any angle
-_SHARES = (0.95, 0.99)  # of the surface that lie within the tolerance, and within twice that
+_SHARES = (0.95, 0.995)  # of the surface that lie within the tolerance, and within twice that
 _NORMAL = 0.01  # m, that a unit of difference between normals counts
 _EQUAL = 0.2  # principal moments that differ by less, relatively, may be equal
 _FEW = 48  # points by which candidates are tried
