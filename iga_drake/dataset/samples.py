@@ -17,6 +17,7 @@ import torch
 from iga_drake.dataset.collections import collection_keys, collection_mesh
 from iga_drake.dataset.depth_camera import Clouds, observe
 from iga_drake.dataset.depth_noise import DepthNoise
+from iga_drake.dataset.relations import RelatedPairs, related_categories, related_pairs
 from iga_drake.dataset.splits import SampleSet, family_names, sample_set
 from iga_drake.geometry.rigid_fit import rigid_fit
 from iga_drake.shapes.composite import CompositeCategory
@@ -71,6 +72,9 @@ class Sample:
     # about which its family is symmetric.
     axes: np.ndarray
     category: tuple[str, str]
+    # (2, N, 3): in W, the unit vector against gravity when the object was seen, where it stood
+    # upright; zero where any way up could have been.
+    up: np.ndarray
     # (2, S, 2, 3): of the test pair's A and B, in W: points of the surface (m) and unit normals;
     # S = 0 unless the options say `test_surface`.
     surface: np.ndarray = field(default_factory=lambda: np.empty((2, 0, 2, 3), np.float32))
@@ -107,7 +111,11 @@ def make_sample(split: str, index: int, config: SampleConfig | None = None) -> S
     chosen = sample_set(split)
     k = stream_index(chosen, index, config)
     objects = [_instances(chosen, k, role, config) for role in range(2)]
-    modes = [_Alignment(chosen, k, mode, objects, config) for mode in range(chosen.modes)]
+    modes: list[_Alignment] | list[_Related]
+    if chosen.relations:
+        modes = [_Related(related_pairs(chosen, k, SIZE), objects, config)]
+    else:
+        modes = [_Alignment(chosen, k, mode, objects, config) for mode in range(chosen.modes)]
     attempt = 0
     while True:
         sample = _observe(chosen, k, attempt, objects, modes, config)
@@ -121,6 +129,8 @@ def category_names(
 ) -> tuple[str, str]:
     """Names of A's and B's categories at index k of the set's streams."""
     config = config or SampleConfig()
+    if chosen.relations:
+        return related_categories(chosen, k)
     return _category(chosen, k, 0, config)[0], _category(chosen, k, 1, config)[0]
 
 
@@ -177,6 +187,10 @@ def instance_meshes(
 ) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
     """The category, vertices (N + 1, V, 3) m of its instances, faces (F, 3), and the symmetry axis
     (2, 3) of the test pair's instance."""
+    if chosen.relations:
+        pairs = related_pairs(chosen, k, SIZE)
+        axis = np.stack((np.zeros(3), _symmetry(pairs.category[role]).direction))
+        return pairs.category[role], pairs.vertices[role], pairs.faces[role], axis
     category, structure = _category(chosen, k, role, config)
     base = chosen.rng("instances", k, role)
     each = [chosen.rng("instances", k, role, n) for n in range(chosen.pairs + 1)]
@@ -326,6 +340,20 @@ class _Alignment:
         self.poses[0] = (R @ RA, pA @ R.T + p)
 
 
+class _Related:
+    """The relation of different products, as `_Alignment`; C is B's own frame, z up."""
+
+    def __init__(self, pairs: RelatedPairs, objects: list[_Object], config: SampleConfig):
+        self.near = []
+        for shape, place in zip(objects, pairs.places, strict=True):
+            distance = np.linalg.norm(shape.points[0] - place, axis=1)
+            self.near.append(distance <= np.quantile(distance, config.neighbourhood))
+        X_BA = pairs.X_BA[1:]
+        own = np.tile(np.eye(3), (len(X_BA), 1, 1))
+        self.poses = [(X_BA[:, :3, :3], X_BA[:, :3, 3]), (own, np.zeros((len(X_BA), 3)))]
+        self.upright = (pairs.relation.upright, True)
+
+
 def _rotation(rng: np.random.Generator) -> np.ndarray:
     """A Haar-uniform rotation (3, 3), from a unit quaternion."""
     q = rng.normal(size=4)
@@ -372,10 +400,16 @@ def _relative_pose(
     return R, b - R @ a + rng.normal(size=3) * 0.06
 
 
-def camera_positions(rng: np.random.Generator, centres: np.ndarray) -> np.ndarray:
-    """Positions (n, CAMERAS, 3) m around centres (n, 3), spread about a random upright each."""
+def camera_positions(
+    rng: np.random.Generator, centres: np.ndarray, up: np.ndarray | None = None
+) -> np.ndarray:
+    """Positions (n, CAMERAS, 3) m around centres (n, 3), above them with regard to `up` (n, 3), or
+    to a random direction each where that is not given or zero."""
     n = len(centres)
-    uprights = np.stack([_aim(v / np.linalg.norm(v)) for v in rng.normal(size=(n, 3))])
+    directions = rng.normal(size=(n, 3))
+    if up is not None:
+        directions = np.where(up.any(1, keepdims=True), up, directions)
+    uprights = np.stack([_aim(v / np.linalg.norm(v)) for v in directions])
     azimuth = rng.uniform(0, 2 * np.pi, (n, 1)) + 2 * np.pi / CAMERAS * np.arange(CAMERAS)
     azimuth = azimuth + rng.normal(size=azimuth.shape) * 0.35
     elevation = np.deg2rad(rng.uniform(15, 65, azimuth.shape))
@@ -390,7 +424,7 @@ def _observe(
     k: int,
     attempt: int,
     objects: list[_Object],
-    alignments: list[_Alignment],
+    alignments: "list[_Alignment] | list[_Related]",
     config: SampleConfig,
 ) -> Sample | None:
     """The pairs as cameras see them; None where too little of an object is seen.
@@ -402,7 +436,7 @@ def _observe(
     mode = np.arange(N) % len(alignments)  # as many demonstrations of each mode as can be
     mode[:-1] = rng.permutation(mode[:-1])
     mode[-1] = rng.integers(len(alignments))
-    joint = rng.random() < config.joint_share and attempt == 0
+    joint = rng.random() < config.joint_share and attempt == 0 and not chosen.relations
     G, g = np.stack([_rotation(rng) for _ in range(N)]), rng.normal(size=(N, 3)) * 0.2
     points = np.empty((N, 2, config.surface_points, 3))
     normals = np.empty_like(points)
@@ -417,7 +451,11 @@ def _observe(
         normals[:, role] = shape.normals[1:] @ np.swapaxes(R, -1, -2)
         near[role] = np.stack([alignments[m].near[role] for m in mode])
     spacing = np.stack([shape.spacing[1:] for shape in objects], 1)  # (N, 2)
-    clouds = _look(rng, points, normals, spacing, joint, chosen, config)
+    up = np.zeros((N, 2, 3))
+    for role in range(2):
+        if isinstance(alignments[0], _Related) and alignments[0].upright[role]:
+            up[:, role] = poses[role, :, :3, 2]
+    clouds = _look(rng, points, normals, spacing, up, joint, chosen, config)
     if int(clouds.distinct.min()) < config.least_seen:
         return None
     index = clouds.index.numpy().transpose(1, 0, 2)  # (2, N, P)
@@ -435,6 +473,7 @@ def _observe(
         modes=_modes(alignments, int(mode[-1]), test_A, test_B),
         axes=np.stack([_move_axis(poses[role, -1], objects[role].axis) for role in range(2)]),
         category=(objects[0].category, objects[1].category),
+        up=up.transpose(1, 0, 2).astype(np.float32),
         surface=surface,
     )
 
@@ -444,11 +483,13 @@ def _look(
     points: np.ndarray,
     normals: np.ndarray,
     spacing: np.ndarray,
+    up: np.ndarray,
     joint: bool,
     chosen: SampleSet,
     config: SampleConfig,
 ) -> Clouds:
-    """Observed clouds (N, 2, ...) of surface points and normals (N, 2, S, 3)."""
+    """Observed clouds (N, 2, ...) of surface points and normals (N, 2, S, 3), whose ways up are
+    `up` (N, 2, 3), zero where unknown."""
     dtype = np.float64 if chosen.double else np.float32
     N, S = len(points), points.shape[2]
     if joint:  # one rig about both
@@ -456,7 +497,7 @@ def _look(
     else:
         points, normals = points.reshape(2 * N, 1, S, 3), normals.reshape(2 * N, 1, S, 3)
         spacing = spacing.reshape(2 * N, 1)
-        cameras = camera_positions(rng, points.mean((1, 2)))
+        cameras = camera_positions(rng, points.mean((1, 2)), up.reshape(2 * N, 3))
     clouds = observe(
         *(torch.from_numpy(a.astype(dtype)) for a in (points, normals, cameras)),
         spacing=torch.from_numpy(spacing.astype(dtype)),
@@ -481,7 +522,7 @@ def _pose(R: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def _modes(
-    alignments: list[_Alignment], shown: int, X_WA: np.ndarray, X_WB: np.ndarray
+    alignments: "list[_Alignment] | list[_Related]", shown: int, X_WA: np.ndarray, X_WB: np.ndarray
 ) -> np.ndarray:
     """(M, 4, 4) motions in W of the test pair's A from the shown mode to each, B held still."""
     motions = []

@@ -38,6 +38,9 @@ class SampleSet:
     test_variation: tuple[float, float] | None = None  # of the test pair; None: as the others
     independent_share: float = 0.25  # of objects whose instances are unrelated products
     noise: bool = True  # of the depth cameras
+    # Different products in the relations of `relations.py`, upright on a table, in place of objects
+    # that touch anywhere; composite_share, modes, variation and independent_share don't count then.
+    relations: bool = False
     # Cameras and DIF-Net in double precision: slower, and the same points on every machine.
     double: bool = False
 
