@@ -1,8 +1,9 @@
 """Relations between different products of our families, stated by their named frames.
 
-Everything stands upright on a table, B always and A where `Relation.upright`; A then goes to where
-a frame of it meets a frame of B, up to one offset that all pairs of a sample share (the height of a
-spout over an opening, say). All pairs show different products: independent parameters and sizes.
+Both objects stand upright on a table when they are seen, but for those that `Relation.upright`
+names; A then goes to where a frame of it meets a frame of B, up to one offset that all pairs of a
+sample share (the height of a spout over an opening, say). All pairs show different products:
+independent parameters and sizes.
 """
 
 from collections.abc import Mapping
@@ -39,7 +40,7 @@ class Relation:
     pitch: Range = (0.0, 0.0)
     yaw: Range = (0.0, 0.0)
     on_table: bool = False  # B's frame counts at the height of the table
-    upright: bool = True  # A stands upright before it is taken
+    upright: tuple[bool, bool] = (True, True)  # whether A and B stand upright when they are seen
     axes: str = ""  # A's frame whose axes count, where it isn't that whose origin does
 
 
@@ -53,12 +54,12 @@ RELATIONS = (
     Relation(
         "hanger on a hook", {"coat_hanger": "hook"}, {"hook_stand": "hook_upper", "rack": "peg"},
         ON_HOOK, (False, True), ((-0.01, 0.01), (0.0, 0.0), (0.005, 0.02)), pitch=_LITTLE,
-        upright=False,
+        upright=(False, True),
     ),
     Relation(
         "ladle on a hook", {"ladle": "tip"}, {"hook_stand": "hook_upper", "rack": "peg"},
         X_UP, (True, False), ((-0.02, -0.01), (0.0, 0.0), (0.0, 0.02)), pitch=_LITTLE, yaw=_LITTLE,
-        axes="handle", upright=False,
+        axes="handle", upright=(False, True),
     ),
     Relation(
         "hat on a hook", {"hat": "crown", "cap": "crown"}, {"hook_stand": "hook_upper"},
@@ -89,7 +90,7 @@ RELATIONS = (
     Relation(
         "spoon in a mug", {"spoon": "tip"}, {"mug": "base", "glass": "base", "bucket": "base"},
         X_UP, offset=((-0.01, 0.01), (-0.01, 0.01), (0.008, 0.015)), pitch=(-0.25, 0.25), yaw=_ANY,
-        upright=False,
+        upright=(False, True),
     ),
     Relation(
         "bottle beside a handle", {"bottle": "base", "vase": "base", "glass": "base"},

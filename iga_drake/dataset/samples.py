@@ -9,14 +9,15 @@ Frames: O, a shape's own; C, of the canonical pair (B as in its O); W, of one ob
 """
 
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 
 import numpy as np
 import torch
 
 from iga_drake.dataset.collections import collection_keys, collection_mesh
-from iga_drake.dataset.depth_camera import Clouds, observe
+from iga_drake.dataset.depth_camera import CALIBRATION, Clouds, observe
 from iga_drake.dataset.depth_noise import DepthNoise
+from iga_drake.dataset.field import CLUTTER, FieldCloud, FieldConfig, disturb
 from iga_drake.dataset.relations import RelatedPairs, related_categories, related_pairs
 from iga_drake.dataset.splits import SampleSet, family_names, sample_set
 from iga_drake.geometry.rigid_fit import rigid_fit
@@ -32,6 +33,12 @@ CAMERAS = 3
 _DEFORMATIONS = ("none", "lattice", "parts", "dif_net")
 SIZE = (0.08, 0.35)  # m, of every instance
 CANONICAL_SIZE = (0.1, 0.3)  # m, log-uniform
+STANDING = 0.85  # share of the objects of families whose own z axis is up; others lie any way
+_VOXELS = (0.003, 0.008)  # m, of clouds as the field gives them
+_CALIBRATION = (0.0, 2.5)  # times the standard deviation of a camera's place, likewise
+
+
+_APART = 48  # samples between two that show the same objects
 
 
 @dataclass(frozen=True)
@@ -46,6 +53,9 @@ class SampleConfig:
     deformations: tuple[float, float, float, float] = (0.25, 0.35, 0.2, 0.2)
     joint_share: float = 0.4  # of the samples: both objects in view hide parts of each other
     least_seen: int = 64  # occupied voxels of a cloud
+    # Share of the clouds that are disturbed as in the field (`FieldConfig`), with voxels and errors
+    # of the cameras' places that differ from sample to sample.
+    field: float = 0.0
     # A collection of meshes (folder, ShapeNetCore.v2, package) that objects are drawn from instead,
     # and the share of the objects that are.
     meshes: str = ""
@@ -64,6 +74,11 @@ class Sample:
     points: np.ndarray  # (2, N, P, 3) m, A and B of one pair in their common frame W
     canonical: np.ndarray  # (2, N, P, 3) place on the canonical instance, in units of its size
     aligned: np.ndarray  # (2, N, P) bool: in the neighbourhood that keeps its pose
+    # (2, N, P) bool: a point of the object; false for clutter, whose `canonical` is 0.
+    present: np.ndarray
+    # (2, N, 3) unit vectors in W, the direction that is up when the object stands; 0 of objects
+    # that may be any way up when they are seen.
+    up: np.ndarray
     size: np.ndarray  # (2, N) m, largest extent of each instance
     mode: np.ndarray  # (N,) int64, which of the modes each pair shows
     # (M, 4, 4) float64: motions of the test pair's A, in W, to every valid alignment; first: none.
@@ -72,9 +87,6 @@ class Sample:
     # about which its family is symmetric.
     axes: np.ndarray
     category: tuple[str, str]
-    # (2, N, 3): in W, the unit vector against gravity when the object was seen, where it stood
-    # upright; zero where any way up could have been.
-    up: np.ndarray
     # (2, S, 2, 3): of the test pair's A and B, in W: points of the surface (m) and unit normals;
     # S = 0 unless the options say `test_surface`.
     surface: np.ndarray = field(default_factory=lambda: np.empty((2, 0, 2, 3), np.float32))
@@ -103,6 +115,7 @@ class _Object:
     normals: np.ndarray  # (N + 1, S, 3)
     spacing: np.ndarray  # (N + 1,) m between neighbouring points
     axis: np.ndarray  # (2, 3) of the test instance: point and direction
+    up: np.ndarray  # (3,) in every instance's own frame, or 0
 
 
 def make_sample(split: str, index: int, config: SampleConfig | None = None) -> Sample:
@@ -110,7 +123,11 @@ def make_sample(split: str, index: int, config: SampleConfig | None = None) -> S
     config = config or SampleConfig()
     chosen = sample_set(split)
     k = stream_index(chosen, index, config)
-    objects = [_instances(chosen, k, role, config) for role in range(2)]
+    if chosen.views == 1:
+        objects = [_instances(chosen, k, role, config) for role in range(2)]
+    else:
+        shown = object_index(chosen, k)
+        objects = [_remembered(chosen.name, shown, role, config) for role in range(2)]
     modes: list[_Alignment] | list[_Related]
     if chosen.relations:
         modes = [_Related(related_pairs(chosen, k, SIZE), objects, config)]
@@ -124,11 +141,21 @@ def make_sample(split: str, index: int, config: SampleConfig | None = None) -> S
         attempt += 1
 
 
+def object_index(chosen: SampleSet, k: int) -> int:
+    """The index at which the set's streams hold the objects of sample k.
+
+    Samples that show the same objects are far enough from each other to be in different batches.
+    """
+    row, column = divmod(k, _APART)
+    return row // chosen.views * _APART + column
+
+
 def category_names(
     chosen: SampleSet, k: int, config: SampleConfig | None = None
 ) -> tuple[str, str]:
     """Names of A's and B's categories at index k of the set's streams."""
     config = config or SampleConfig()
+    k = object_index(chosen, k)
     if chosen.relations:
         return related_categories(chosen, k)
     return _category(chosen, k, 0, config)[0], _category(chosen, k, 1, config)[0]
@@ -179,7 +206,21 @@ def _instances(chosen: SampleSet, k: int, role: int, config: SampleConfig) -> _O
     """The canonical instance of a category and N instances around it."""
     category, vertices, faces, axis = instance_meshes(chosen, k, role, config)
     rng = chosen.rng("instances", k, role, chosen.pairs + 1)
-    return _Object(category, *surface_points(rng, vertices, faces, config.surface_points), axis)
+    surface = surface_points(rng, vertices, faces, config.surface_points)
+    # A key of its own: the other draws stay as they are.
+    lies = chosen.rng("instances", k, role, chosen.pairs + 2)
+    up = np.array([0.0, 0.0, 1.0])
+    if chosen.relations:
+        up *= related_pairs(chosen, k, SIZE).relation.upright[role]
+    elif category == COMPOSITE or lies.random() >= STANDING:
+        up = _direction(lies)
+    return _Object(category, *surface, axis, up)
+
+
+@lru_cache(maxsize=2 * _APART)
+def _remembered(name: str, k: int, role: int, config: SampleConfig) -> _Object:
+    """The instances of the set of that name, kept while samples show them again."""
+    return _instances(sample_set(name), k, role, config)
 
 
 def instance_meshes(
@@ -262,9 +303,8 @@ def _deformer(kind: str, level: float, cells: int, double: bool) -> Deformer | N
 def canonical_mesh(split: str, index: int, role: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) m and faces (F, 3) of a sample's canonical A (role 0) or B (role 1)."""
     chosen, config = sample_set(split), SampleConfig()
-    _, vertices, faces, _ = instance_meshes(
-        chosen, stream_index(chosen, index, config), role, config
-    )
+    k = object_index(chosen, stream_index(chosen, index, config))
+    _, vertices, faces, _ = instance_meshes(chosen, k, role, config)
     return vertices[0], faces
 
 
@@ -341,7 +381,7 @@ class _Alignment:
 
 
 class _Related:
-    """The relation of different products, as `_Alignment`; C is B's own frame, z up."""
+    """The relation of different products, as `_Alignment`; C is B's own frame."""
 
     def __init__(self, pairs: RelatedPairs, objects: list[_Object], config: SampleConfig):
         self.near = []
@@ -351,7 +391,6 @@ class _Related:
         X_BA = pairs.X_BA[1:]
         own = np.tile(np.eye(3), (len(X_BA), 1, 1))
         self.poses = [(X_BA[:, :3, :3], X_BA[:, :3, 3]), (own, np.zeros((len(X_BA), 3)))]
-        self.upright = (pairs.relation.upright, True)
 
 
 def _rotation(rng: np.random.Generator) -> np.ndarray:
@@ -365,6 +404,12 @@ def _rotation(rng: np.random.Generator) -> np.ndarray:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def _direction(rng: np.random.Generator) -> np.ndarray:
+    """A random unit vector (3,)."""
+    vector = rng.normal(size=3)
+    return vector / np.linalg.norm(vector)
 
 
 def _aim(z: np.ndarray) -> np.ndarray:
@@ -403,13 +448,14 @@ def _relative_pose(
 def camera_positions(
     rng: np.random.Generator, centres: np.ndarray, up: np.ndarray | None = None
 ) -> np.ndarray:
-    """Positions (n, CAMERAS, 3) m around centres (n, 3), above them with regard to `up` (n, 3), or
-    to a random direction each where that is not given or zero."""
+    """Positions (n, CAMERAS, 3) m around centres (n, 3), spread about a random upright each, or
+    above them in the direction of unit vectors up (n, 3); rows that are 0 leave it at random."""
     n = len(centres)
-    directions = rng.normal(size=(n, 3))
+    uprights = np.stack([_aim(v / np.linalg.norm(v)) for v in rng.normal(size=(n, 3))])
     if up is not None:
-        directions = np.where(up.any(1, keepdims=True), up, directions)
-    uprights = np.stack([_aim(v / np.linalg.norm(v)) for v in directions])
+        known = np.square(up).sum(1) > 0.5
+        if known.any():
+            uprights[known] = np.stack([_aim(v) for v in up[known]])
     azimuth = rng.uniform(0, 2 * np.pi, (n, 1)) + 2 * np.pi / CAMERAS * np.arange(CAMERAS)
     azimuth = azimuth + rng.normal(size=azimuth.shape) * 0.35
     elevation = np.deg2rad(rng.uniform(15, 65, azimuth.shape))
@@ -451,59 +497,93 @@ def _observe(
         normals[:, role] = shape.normals[1:] @ np.swapaxes(R, -1, -2)
         near[role] = np.stack([alignments[m].near[role] for m in mode])
     spacing = np.stack([shape.spacing[1:] for shape in objects], 1)  # (N, 2)
-    up = np.zeros((N, 2, 3))
-    for role in range(2):
-        if isinstance(alignments[0], _Related) and alignments[0].upright[role]:
-            up[:, role] = poses[role, :, :3, 2]
-    clouds = _look(rng, points, normals, spacing, up, joint, chosen, config)
+    up = np.stack([poses[role, :, :3, :3] @ shape.up for role, shape in enumerate(objects)])
+    field = chosen.rng("views", k, attempt, 1)
+    above = np.where(field.random((2, N, 1)) < chosen.from_above, up, 0)
+    clouds = _look(rng, field, points, normals, spacing, above, joint, chosen, config)
     if int(clouds.distinct.min()) < config.least_seen:
         return None
     index = clouds.index.numpy().transpose(1, 0, 2)  # (2, N, P)
     canonical = [shape.points[0] / np.ptp(shape.points[0], axis=0).max() for shape in objects]
+    observed = np.ascontiguousarray(clouds.points.numpy().transpose(1, 0, 2, 3), np.float32)
+    place = np.stack([canonical[role][index[role]] for role in range(2)]).astype(np.float32)
+    aligned = np.take_along_axis(near, index, 2)
+    present = np.ones(index.shape, bool)
+    if config.field:
+        observed, source = _in_the_field(observed, up, field, config)
+        present = source != CLUTTER
+        taken = np.where(present, source, 0)
+        place = np.take_along_axis(place, taken[..., None], 2) * present[..., None]
+        aligned = np.take_along_axis(aligned, taken, 2) & present
     test_A, test_B = poses[:, -1]
     surface = np.stack((points[-1], normals[-1]), 2).astype(np.float32)
     if not config.test_surface:
         surface = surface[:, :0]
     return Sample(
-        points=np.ascontiguousarray(clouds.points.numpy().transpose(1, 0, 2, 3), np.float32),
-        canonical=np.stack([canonical[role][index[role]] for role in range(2)]).astype(np.float32),
-        aligned=np.take_along_axis(near, index, 2),
+        points=observed,
+        canonical=place,
+        aligned=aligned,
+        present=present,
+        up=up.astype(np.float32),
         size=np.stack([np.ptp(s.points[1:], axis=1).max(1) for s in objects]).astype(np.float32),
         mode=mode,
         modes=_modes(alignments, int(mode[-1]), test_A, test_B),
         axes=np.stack([_move_axis(poses[role, -1], objects[role].axis) for role in range(2)]),
         category=(objects[0].category, objects[1].category),
-        up=up.transpose(1, 0, 2).astype(np.float32),
         surface=surface,
     )
 
 
+def _in_the_field(
+    points: np.ndarray, up: np.ndarray, rng: np.random.Generator, config: SampleConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Disturbed clouds (2, N, P, 3) float32, and the source (2, N, P) of their points: see
+    `FieldCloud`. A cloud of more than P points loses some at random, others repeat."""
+    P = points.shape[2]
+    result, source = np.empty_like(points), np.empty(points.shape[:3], np.int64)
+    how = FieldConfig(disturbed=config.field)
+    for role, n in np.ndindex(points.shape[:2]):
+        cloud: FieldCloud = disturb(
+            points[role, n], rng, up=up[role, n], other=points[1 - role, n], config=how
+        )
+        drawn = rng.permutation(len(cloud.points))[np.arange(P) % len(cloud.points)]
+        result[role, n], source[role, n] = cloud.points[drawn], cloud.source[drawn]
+    return result, source
+
+
 def _look(
     rng: np.random.Generator,
+    field: np.random.Generator,
     points: np.ndarray,
     normals: np.ndarray,
     spacing: np.ndarray,
-    up: np.ndarray,
+    above: np.ndarray,
     joint: bool,
     chosen: SampleSet,
     config: SampleConfig,
 ) -> Clouds:
-    """Observed clouds (N, 2, ...) of surface points and normals (N, 2, S, 3), whose ways up are
-    `up` (N, 2, 3), zero where unknown."""
+    """Observed clouds (N, 2, ...) of surface points and normals (N, 2, S, 3); `above` (2, N, 3) is
+    the direction from which the cameras look, 0 for any."""
     dtype = np.float64 if chosen.double else np.float32
     N, S = len(points), points.shape[2]
     if joint:  # one rig about both
-        cameras = camera_positions(rng, points.mean((1, 2)))
+        cameras = camera_positions(rng, points.mean((1, 2)), above[1])
     else:
         points, normals = points.reshape(2 * N, 1, S, 3), normals.reshape(2 * N, 1, S, 3)
         spacing = spacing.reshape(2 * N, 1)
-        cameras = camera_positions(rng, points.mean((1, 2)), up.reshape(2 * N, 3))
+        flat = above.transpose(1, 0, 2).reshape(2 * N, 3)
+        cameras = camera_positions(rng, points.mean((1, 2)), flat)
+    voxel, calibration = config.voxel, CALIBRATION
+    if config.field:
+        voxel = field.uniform(*_VOXELS) if field.random() < 0.5 else voxel
+        calibration *= field.uniform(*_CALIBRATION)
     clouds = observe(
         *(torch.from_numpy(a.astype(dtype)) for a in (points, normals, cameras)),
         spacing=torch.from_numpy(spacing.astype(dtype)),
-        voxel=config.voxel,
+        voxel=voxel,
         count=config.cloud_points,
         noise=DepthNoise() if chosen.noise else None,
+        calibration=calibration,
         generator=torch.Generator().manual_seed(int(rng.integers(1 << 62))),
     )
     P = config.cloud_points

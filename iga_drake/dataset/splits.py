@@ -37,6 +37,8 @@ class SampleSet:
     variation: tuple[float, float] = (0.0, 0.6)
     test_variation: tuple[float, float] | None = None  # of the test pair; None: as the others
     independent_share: float = 0.25  # of objects whose instances are unrelated products
+    views: int = 1  # samples that show the same two objects, aligned and seen anew each time
+    from_above: float = 0.0  # share of the clouds whose cameras stand above the object's up
     noise: bool = True  # of the depth cameras
     # Different products in the relations of `relations.py`, upright on a table, in place of objects
     # that touch anywhere; composite_share, modes, variation and independent_share don't count then.

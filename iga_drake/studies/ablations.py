@@ -44,7 +44,8 @@ from iga_drake.evaluation.results import ResultsStore, code_key
 from iga_drake.files import write_text
 from iga_drake.geometry.se3 import rigid
 from iga_drake.paths import models_dir
-from iga_drake.training.descriptor import DescriptorTraining, train_descriptor, validate
+from iga_drake.training.correspondence import DescriptorTraining
+from iga_drake.training.descriptor import train_descriptor, validate
 from iga_drake.training.energy import VALIDATION as ENERGY_SET
 from iga_drake.training.energy import EnergyTraining, train_energy
 from iga_drake.training.run import RunConfig, SavedState

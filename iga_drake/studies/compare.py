@@ -39,7 +39,7 @@ from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.alignment import COLUMNS, Errors
 from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, config_digest
 from iga_drake.files import write_text
-from iga_drake.training.descriptor import DescriptorTraining, correspondence_loss
+from iga_drake.training.correspondence import LOSS_FIELDS, DescriptorTraining, descriptor_loss
 from iga_drake.training.paper import (
     ENERGIES,
     FRAMES,
@@ -171,8 +171,8 @@ def descriptor_flops(weights: Path) -> float:
     batch = collate([make_sample("train", 0, samples)])
 
     def step() -> None:
-        some = {name: batch[name] for name in ("points", "canonical")}
-        correspondence_loss(net, some, config).total.backward()
+        some = {name: batch[name] for name in LOSS_FIELDS}
+        descriptor_loss(net, some, config).total.backward()
 
     return counted(step)
 

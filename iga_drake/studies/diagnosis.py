@@ -33,7 +33,7 @@ from iga_drake.dataset.splits import sample_set
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.alignment import COLUMNS, FIVE_SETS, FLIP, Errors
 from iga_drake.geometry.se3 import geodesic_angle, kabsch, rigid, so3_exp, transform
-from iga_drake.training.descriptor import DescriptorTraining
+from iga_drake.training.correspondence import DescriptorTraining
 
 WRONG = np.radians(FLIP)  # a coarse hypothesis further off than this is wrong
 TERCILES = ("least", "middle", "most")

@@ -101,8 +101,7 @@ def test_b_stands_upright_under_the_cameras(index: int) -> None:
     assert np.linalg.norm(sample.up[1].mean(0)) < 0.95
 
 
-def test_other_sets_know_no_way_up_and_no_relation_is_foreign_to_itself() -> None:
-    assert not make_sample("validation", 0).up.any()
+def test_no_relation_is_foreign_to_itself() -> None:
     other = foreign_sample("cross_instance", 0)
     assert not set(other.category) & set(category_names(SET, 0))
     vertices, faces = canonical_mesh("cross_instance", 0, 1)

@@ -29,7 +29,7 @@ from iga_drake.studies.ablations import (
     evaluate_ablations,
 )
 from iga_drake.training import energy_problems
-from iga_drake.training.descriptor import DescriptorTraining
+from iga_drake.training.correspondence import DescriptorTraining
 from iga_drake.training.energy import EnergyTraining
 
 SMALL = DescriptorConfig(scalars=16, vectors=4, heads=2, layers=2, descriptor=16)

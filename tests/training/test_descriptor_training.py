@@ -2,20 +2,18 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from descriptor_runs import assert_same, state
 
-from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
+from iga_drake.aligners.iga.descriptor import DescriptorConfig
 from iga_drake.aligners.iga.weights import load_descriptor
 from iga_drake.checkpoint import CheckpointError
 from iga_drake.dataset.samples import SampleConfig
+from iga_drake.training.correspondence import DescriptorTraining
 from iga_drake.training.descriptor import (
     DescriptorSettings,
-    DescriptorTraining,
     RunOptions,
-    correspondence_loss,
     train_descriptor,
     validate,
 )
@@ -80,45 +78,6 @@ def test_accumulated_gradients_are_those_of_one_batch(
     for name, tensor in one.items():
         if name.startswith("m."):  # a tenth of the gradient
             torch.testing.assert_close(parts[name], tensor, atol=1e-7, rtol=0, msg=name)
-
-
-def test_the_loss_is_the_cross_entropy_of_the_visible_nodes() -> None:
-    """Against sums in loops, for every pair of instances."""
-    torch.manual_seed(3)
-    net, config = DescriptorNet(MODEL), _config(1, nodes=6, visible_within=0.3)
-    points, canonical = torch.randn(2, 2, 3, 20, 3), torch.rand(2, 2, 3, 20, 3)
-    with torch.no_grad():
-        term = correspondence_loss(net, {"points": points, "canonical": canonical}, config)
-        torch.manual_seed(4)
-        start = torch.randint(20, (12,))
-        term = correspondence_loss(net, {"points": points, "canonical": canonical}, config, start)
-        clouds, places = points.flatten(0, 2), canonical.flatten(0, 2)
-        from iga_drake.geometry.clouds import furthest_point_sampling
-
-        nodes = furthest_point_sampling(clouds, 6, start)
-        descriptors = net(clouds, nodes, group=3)
-        total, count, positive, negative = 0.0, 0, [], []
-        for i in range(12):
-            for j in range(12):
-                if i == j or i // 3 != j // 3:
-                    continue
-                logits = net.similarity(descriptors[i], descriptors[j]).double().numpy()
-                a, b = places[i, nodes[i]].numpy(), places[j, nodes[j]].numpy()
-                for node in range(6):
-                    d = np.linalg.norm(a[node] - b, axis=1)
-                    if d.min() >= 0.3:
-                        continue
-                    target = np.exp(-(d**2) / (2 * 0.05**2) + d.min() ** 2 / (2 * 0.05**2))
-                    target /= target.sum()
-                    total -= target @ (logits[node] - np.log(np.exp(logits[node]).sum()))
-                    count += 1
-                    positive.append(target @ logits[node])
-                    if (d > 0.15).any():
-                        negative.append(logits[node][d > 0.15].max())
-    assert int(term.count) == count > 50
-    assert float(term.total) == pytest.approx(total, rel=1e-4)
-    assert float(term.statistics["positive_logit"]) == pytest.approx(np.mean(positive), rel=1e-3)
-    assert float(term.statistics["negative_logit"]) == pytest.approx(np.mean(negative), rel=1e-3)
 
 
 def test_training_lowers_the_error_on_samples_it_has_not_seen(tmp_path: Path) -> None:

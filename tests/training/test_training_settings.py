@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from iga_drake.training.descriptor import DescriptorTraining
+from iga_drake.training.correspondence import DescriptorTraining
 from iga_drake.training.settings import TrainingError, read_settings, replaced
 
 

@@ -255,5 +255,12 @@ class IgaAligner:
     def _logits(self, points: Tensor, chosen: Tensor) -> Tensor:
         """(2, D, M, M) of the test nodes' matches, learned; clouds (2 (D + 1), P, 3)."""
         half = len(points) // 2
-        descriptors = self._net(points, chosen, group=half).double().unflatten(0, (2, half))
-        return self._net.similarity(descriptors[:, -1:], descriptors[:, :-1])
+        points, chosen = points.unflatten(0, (2, half)), chosen.unflatten(0, (2, half))
+        shown = self._net(
+            points[:, :-1].flatten(0, 1), chosen[:, :-1].flatten(0, 1), group=half - 1
+        )
+        test = self._net(points[:, -1], chosen[:, -1], memory=shown.memory)
+        return self._net.similarity(
+            test.descriptors.double()[:, None],
+            shown.descriptors.double().unflatten(0, (2, half - 1)),
+        )

@@ -6,12 +6,17 @@ messages. Cross and triple products make the features sensitive to handedness: w
 and the right side of a mirror-symmetric object would look the same. The result is exactly invariant
 under rotations and translations, and independent of the order of the points for given nodes.
 
-Clouds of the same object (demonstrations and test) may be described together: their nodes then also
-attend to each other's invariant scalars, which says what is common to all of them. The result stays
-invariant under separate motions of every cloud and equivariant under the order of the clouds.
+Clouds of the same object are described together. The demonstrations' nodes also attend to each
+other's invariant scalars, which says what is common to all of them; they don't see the test cloud,
+so that they are described once for all. The test cloud's nodes attend to the demonstrations' in
+turn. The result stays invariant under separate motions of every cloud and equivariant under the
+order of the demonstrations.
+
+A cloud may come with the direction that is up, one more vector that turns with it.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -55,7 +60,8 @@ class _OnChannels(nn.Linear):
     """A linear layer on the channels of x (B, C, N)."""
 
     def forward(self, x: Tensor) -> Tensor:
-        return (self.weight @ x).add_(self.bias[:, None])
+        # A batched product: a plain one would copy x with its channels last.
+        return torch.baddbmm(self.bias[None, :, None], self.weight.expand(len(x), -1, -1), x)
 
 
 class ContextLayer(nn.Module):
@@ -136,7 +142,7 @@ class ContextLayer(nn.Module):
 
 
 class CrossLayer(nn.Module):
-    """Attention of every node to the nodes of all other clouds of the same object.
+    """Attention of every node to the nodes of other clouds of the same object.
 
     Starts as the identity, so that it can be added to a trained network.
     """
@@ -155,19 +161,41 @@ class CrossLayer(nn.Module):
         nn.init.zeros_(last.bias)
         self.mlp = nn.Sequential(nn.Linear(2 * d, 2 * d), nn.GELU(), last)
 
-    def forward(self, s: Tensor, group: int) -> Tensor:
-        # s (G * group, M, d): clouds of one object are neighbours
+    def _heads(self, s: Tensor, group: int) -> Tensor:
+        """(G * group, M, d) -> (G, heads, group * M, width)."""
+        return (
+            s.unflatten(0, (-1, group))
+            .flatten(1, 2)
+            .unflatten(-1, (self.heads, -1))
+            .transpose(1, 2)
+        )
+
+    def memory(self, s: Tensor, group: int) -> tuple[Tensor, Tensor]:
+        """Keys and values (G, heads, group * M, width) of clouds s (G * group, M, d)."""
+        n = self.norm(s)
+        return self._heads(self.key(n), group), self._heads(self.value(n), group)
+
+    def forward(self, s: Tensor, group: int, memory: tuple[Tensor, Tensor], *, own: bool) -> Tensor:
+        """Clouds s (G * group, M, d), the clouds of one object neighbours, after they attended to
+        `memory`; where that is their `own`, every cloud attends to the other ones alone."""
         B, M, d = s.shape
-        n = self.norm(s).reshape(B // group, group * M, d)
-        q, k, v = (
-            f(n).unflatten(-1, (self.heads, -1)).transpose(1, 2)
-            for f in (self.query, self.key, self.value)
-        )  # (G, h, group * M, width)
-        cloud = torch.arange(group, device=s.device).repeat_interleave(M)
-        others = cloud[:, None] != cloud
-        message = nn.functional.scaled_dot_product_attention(q, k, v, attn_mask=others)
+        q = self._heads(self.query(self.norm(s)), group)
+        others = None
+        if own:
+            cloud = torch.arange(group, device=s.device).repeat_interleave(M)
+            others = cloud[:, None] != cloud
+        message = nn.functional.scaled_dot_product_attention(q, *memory, attn_mask=others)
         message = message.transpose(1, 2).reshape(B, M, d).to(s.dtype)
         return s + self.mlp(self.norm2(torch.cat((s, message), -1)))
+
+
+class Description(NamedTuple):
+    """What the network says of the nodes of B clouds, and what other clouds can attend to."""
+
+    descriptors: Tensor  # (B, M, D) unit
+    presence: Tensor  # (B, M) logits that a node lies on the object, not on what surrounds it
+    # Of each layer that attends to other clouds, keys and values (G, heads, group * M, width).
+    memory: tuple[tuple[Tensor, Tensor], ...]
 
 
 def _local_stage(config: DescriptorConfig) -> nn.Module:
@@ -181,10 +209,7 @@ def _local_stage(config: DescriptorConfig) -> nn.Module:
 
 
 class DescriptorNet(nn.Module):
-    """Clouds (B, P, 3) and node indices (B, M) -> unit descriptors (B, M, D).
-
-    `group` clouds that follow each other show the same object and are described together.
-    """
+    """Describes nodes of clouds: descriptors that match where places correspond."""
 
     def __init__(self, config: DescriptorConfig):
         super().__init__()
@@ -196,6 +221,10 @@ class DescriptorNet(nn.Module):
         self.head = nn.Sequential(
             nn.LayerNorm(config.scalars), nn.Linear(config.scalars, config.descriptor)
         )
+        self.presence = nn.Linear(config.scalars, 1)
+        # Until it has learned to tell, every node belongs to the object.
+        nn.init.zeros_(self.presence.weight)
+        nn.init.constant_(self.presence.bias, 4.0)
         self.log_temperature = nn.Parameter(torch.tensor(2.3))
 
     @staticmethod
@@ -205,22 +234,50 @@ class DescriptorNet(nn.Module):
         scale = (points - centre).square().sum(-1).mean(1).sqrt().clamp_min(1e-4)
         return (points - centre) / scale[:, None, None], centre, scale
 
-    def forward(self, points: Tensor, nodes: Tensor, group: int = 1) -> Tensor:
+    def forward(
+        self,
+        points: Tensor,
+        nodes: Tensor,
+        *,
+        group: int = 1,
+        up: Tensor | None = None,
+        memory: tuple[tuple[Tensor, Tensor], ...] | None = None,
+    ) -> Description:
+        """Describes nodes (B, M), indices of points (B, P, 3).
+
+        Args:
+          group: so many clouds that follow each other show the same object; B = G * group.
+          up: (B, 3) unit vectors in the clouds' frames; zero where up is not known. Default: all.
+          memory: of a description of the same G objects' demonstrations; the clouds then attend to
+            these. Default: they are demonstrations, and attend to the others of their group.
+        """
         cfg = self.config
         x, _, _ = self.normalise(points)
         p = torch.gather(x, 1, nodes[..., None].expand(-1, -1, 3))  # (B, M, 3)
+        if up is None:
+            up = torch.zeros_like(x[:, 0])
         with torch.autocast(points.device.type, enabled=False):  # differences of positions
-            s, v = self.local(x, p)
+            s, v = self.local(x, p, up)
         gap = p.mT[:, :, None] - p.mT[..., None]  # (B, 3, M, M)
         length = gap.square().sum(1, keepdim=True).add(1e-8).sqrt()
         shrink = 1 / (length + 0.02)
         centres = torch.linspace(0, 3.0, cfg.distance_bases, device=p.device, dtype=s.dtype)
         bases = torch.exp((length.to(s.dtype) - centres[:, None, None]) ** 2 / (-2 * 0.3**2))
+        own = memory is None
+        written = []
         for k, layer in enumerate(self.layers):
-            if k and self.cross and group > 1:
-                s = self.cross[k - 1](s, group)
+            if k and self.cross:
+                cross = self.cross[k - 1]
+                written.append(cross.memory(s, group))  # type: ignore[operator]
+                if group > 1 or not own:  # a single demonstration has no others
+                    attended = written[-1] if memory is None else memory[k - 1]
+                    s = cross(s, group, attended, own=own)
             s, v = layer(s, v, p, bases, shrink)
-        return nn.functional.normalize(self.head(s), dim=-1)
+        return Description(
+            nn.functional.normalize(self.head(s), dim=-1),
+            self.presence(s)[..., 0],
+            tuple(written),
+        )
 
     def mixed_precision(self) -> "DescriptorNet":
         """In place: double precision for all that turns with the clouds, single for invariants.

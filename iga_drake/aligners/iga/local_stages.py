@@ -1,8 +1,9 @@
 """First stages of the descriptor network: encoders of a node's surroundings.
 
-Every stage turns a cloud (B, P, 3), of unit root-mean-square radius about its centroid, and nodes
-(B, M, 3) among its points into scalars (B, M, d) and vectors (B, M, 3, c). `LocalMoments` is the
-default; `LocalParts` and `LocalCoordinates` are there to compare it with.
+Every stage turns a cloud (B, P, 3), of unit root-mean-square radius about its centroid, nodes
+(B, M, 3) among its points and the direction that is up (B, 3), zero where it is not known, into
+scalars (B, M, d) and vectors (B, M, 3, c). `LocalMoments` is the default; `LocalParts` and
+`LocalCoordinates` are there to compare it with, and don't look at what is up.
 """
 
 import dataclasses
@@ -22,7 +23,7 @@ def shell_moments(x: Tensor, p: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, 
     """Moments of dense clouds x (B, P, 3) over radial shells around nodes p (B, M, 3).
 
     Shares of the points (B, M, S, 1); mean offsets from the node (B, M, S, 3) and second moments
-    about it (B, M, S, 3, 3), in units of the shell's radius and of its square.
+    about it (B, M, S, 3, 3), in units of the shell's radius and of its square; 0 in empty shells.
     """
     B, M, _ = p.shape
     S = len(radii)
@@ -36,14 +37,15 @@ def shell_moments(x: Tensor, p: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, 
     # In this order (few rows, not few columns) it is quicker.
     moments = (powers.mT @ window.flatten(1, 2).mT).mT
     moments = moments.reshape(B, M, S, 13) / x.shape[1]
-    mass = moments[..., :1].clamp_min(1e-5)
-    mean = moments[..., 1:4] / mass
-    second = (moments[..., 4:] / mass).reshape(B, M, S, 3, 3)
+    share, first = moments[..., :1], moments[..., 1:4]
+    second = moments[..., 4:].reshape(B, M, S, 3, 3)
     q = p[:, :, None]
-    offset = (mean - q) / r
-    mean_q = mean[..., :, None] * q[..., None, :]
-    second = second - mean_q - mean_q.transpose(-1, -2) + q[..., :, None] * q[..., None, :]
-    return mass, offset, second / r[..., None] ** 2
+    # About the node, before the division: what an empty shell has is 0.
+    first_q = first[..., :, None] * q[..., None, :]
+    outer_q = q[..., :, None] * q[..., None, :]
+    second = second - first_q - first_q.transpose(-1, -2) + share[..., None] * outer_q
+    mass = share.clamp_min(1e-5)
+    return mass, (first - share * q) / (mass * r), second / (mass * r**2)[..., None]
 
 
 class LocalMoments(nn.Module):
@@ -61,18 +63,19 @@ class LocalMoments(nn.Module):
         super().__init__()
         S, c = len(shells), vectors
         self.register_buffer("radii", torch.tensor(shells), persistent=False)
-        self.mix = VectorLinear(S + 1, c)
+        self.mix = VectorLinear(S + 2, c)
         self.bend = VectorLinear(S * c, c)
-        self.out = VectorLinear(2 * c + S + 1, c)
+        self.out = VectorLinear(2 * c + S + 2, c)
         self.embed = nn.Sequential(
-            nn.Linear(5 * S + 4 * c, scalars), nn.GELU(), nn.Linear(scalars, scalars)
+            nn.Linear(6 * S + 4 * c + 2, scalars), nn.GELU(), nn.Linear(scalars, scalars)
         )
 
-    def forward(self, x: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        # x (B, P, 3) dense cloud, p (B, M, 3) nodes -> scalars (B, M, d), vectors (B, M, 3, c)
+    def forward(self, x: Tensor, p: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
+        """See the module."""
         mass, offset, second = shell_moments(x, p, self.radii)
         q = p[:, :, None]
-        base = torch.cat((offset, -q), 2).transpose(-1, -2)  # (B, M, 3, S + 1)
+        up = up[:, None, None].expand(-1, q.shape[1], -1, -1)  # (B, M, 1, 3)
+        base = torch.cat((offset, -q, up), 2).transpose(-1, -2)  # (B, M, 3, S + 2)
         v = self.mix(base)
         bent = (second @ v[:, :, None]).transpose(2, 3).flatten(3)  # (B, M, 3, S c)
         w = self.bend(bent)
@@ -91,6 +94,9 @@ class LocalMoments(nn.Module):
                 w.square().sum(-2),
                 (cross[..., :half] * v[..., half:]).sum(-2),
                 (cross[..., half:] * w[..., :half]).sum(-2),
+                (offset * up).sum(-1),
+                (q * up).sum(-1),
+                up.square().sum(-1),
             ),
             -1,
         )
@@ -115,7 +121,7 @@ class LocalParts(nn.Module):
             nn.Linear(scalars, scalars),
         )
 
-    def forward(self, x: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, x: Tensor, p: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
         """See the module."""
         parts = self.encoder(x, index=torch.cdist(p[:, :PARTS], x).argmin(-1))
         owner = nearest_centre(p, parts.centres)[..., None]  # (B, M, 1)
@@ -149,7 +155,7 @@ class LocalCoordinates(nn.Module):
         )
         self.sizes = (d, 3 * c)
 
-    def forward(self, x: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, x: Tensor, p: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
         """See the module."""
         mass, offset, second = shell_moments(x, p, self.radii)
         i, j = torch.triu_indices(3, 3, device=x.device)
