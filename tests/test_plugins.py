@@ -33,7 +33,7 @@ class Still:
     def __init__(self, *, diary=""):
         self.diary = diary
 
-    def align(self, context, grasped, target, *, seed=0):
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
         if self.diary:
             open(self.diary, "a").write(f"{len(context)} demonstrations\\n")
         return PoseEstimate(np.eye(4)[None], np.zeros(1), np.ones(1))

@@ -3,13 +3,15 @@
 Per demonstration the grasped and the target cloud are registered with the test's (Open3D,
 multi-start, point-to-plane); with `X_A`, `X_B` from demonstration to test the answer is
 `X_B X_A^-1`. The best demonstration is the one with the smallest mean distance of both
-registrations.
+registrations. Where an object's way up is known, its registrations start from turns about it.
 """
 
 import numpy as np
 
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate
-from iga_drake.demonstrations.alignment import Alignment, check_cloud
+from iga_drake.demonstrations.alignment import Alignment, check_cloud, check_direction
+
+_Ups = tuple[np.ndarray, np.ndarray]  # ways up (3,) of a source and of a goal
 
 
 def _open3d():
@@ -22,12 +24,28 @@ def _open3d():
     return open3d
 
 
-def _starts(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Rotations (count, 3, 3): the identity and Haar-uniform ones."""
+def _starts(count: int, rng: np.random.Generator, ups: _Ups | None) -> np.ndarray:
+    """Rotations (count, 3, 3): the identity and Haar-uniform ones; with the ways up of source and
+    goal, turns about them by equal angles, the first one drawn."""
     from scipy.spatial.transform import Rotation
 
-    rotations = Rotation.random(count - 1, rng=rng).as_matrix()
-    return np.concatenate((np.eye(3)[None], rotations))
+    if ups is None:
+        rotations = Rotation.random(count - 1, rng=rng).as_matrix()
+        return np.concatenate((np.eye(3)[None], rotations))
+    angles = 2 * np.pi * (rng.uniform() + np.arange(count)) / count
+    upright, _ = Rotation.align_vectors(ups[1][None], ups[0][None])
+    return (Rotation.from_rotvec(angles[:, None] * ups[1]) * upright).as_matrix()
+
+
+def _ups(
+    demonstrated: list[np.ndarray | None], test: np.ndarray | None, name: str
+) -> list[_Ups | None]:
+    """For each demonstration its way up and the test's; None unless all are known."""
+    if test is None:
+        return [None] * len(demonstrated)
+    test = check_direction(test, name)
+    known = [(up, test) for up in demonstrated if up is not None]
+    return list(known) if len(known) == len(demonstrated) else [None] * len(demonstrated)
 
 
 class IcpAligner:
@@ -41,14 +59,16 @@ class IcpAligner:
         self.refined = refined
         self.voxel = voxel
 
-    def _register(self, source, goal, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    def _register(
+        self, source, goal, rng: np.random.Generator, ups: _Ups | None
+    ) -> tuple[np.ndarray, float]:
         """Motion (4, 4) of the source cloud onto the goal and the symmetric mean distance (m)."""
         o3d = _open3d()
         reg = o3d.pipelines.registration
         coarse_s, coarse_g = (c.voxel_down_sample(self.voxel) for c in (source, goal))
         centre_s, centre_g = (np.asarray(c.points).mean(0) for c in (source, goal))
         trials = []
-        for R in _starts(self.starts, rng):
+        for R in _starts(self.starts, rng, ups):
             X = np.eye(4)
             X[:3, :3] = R
             X[:3, 3] = centre_g - R @ centre_s
@@ -80,6 +100,8 @@ class IcpAligner:
         grasped: np.ndarray,
         target: np.ndarray,
         *,
+        grasped_up: np.ndarray | None = None,
+        target_up: np.ndarray | None = None,
         seed: int = 0,
     ) -> PoseEstimate:
         """See `Aligner.align`. One mode per demonstration; the energy is the mean distance in
@@ -96,10 +118,12 @@ class IcpAligner:
 
         test_A = cloud(check_cloud(grasped, "grasped"))
         test_B = cloud(check_cloud(target, "target"))
+        ups_A = _ups([a.grasped_up for a in context], grasped_up, "grasped_up")
+        ups_B = _ups([a.target_up for a in context], target_up, "target_up")
         poses, energies = [], []
-        for alignment in context:
-            X_A, error_A = self._register(cloud(alignment.grasped), test_A, rng)
-            X_B, error_B = self._register(cloud(alignment.target), test_B, rng)
+        for alignment, up_A, up_B in zip(context, ups_A, ups_B, strict=True):
+            X_A, error_A = self._register(cloud(alignment.grasped), test_A, rng, up_A)
+            X_B, error_B = self._register(cloud(alignment.target), test_B, rng, up_B)
             poses.append(X_B @ np.linalg.inv(X_A))
             energies.append(100 * (error_A + error_B))
         order = np.argsort(energies)

@@ -5,8 +5,14 @@ end-effector frame E), `target` the cloud of object B in any frame W (for the ro
 `Alignment` holds both clouds of a demonstration in one common frame. The estimate is `X_WF`: the
 pose that carries the grasped cloud to where the demonstrations want it. With F = E this is the
 target end-effector pose `X_WE` (a rigid grasp moves the object with the hand).
+
+Ways up. Where an object always stands, or is held, the same way up when it is observed, that
+direction (against gravity, fixed to the object) may be given beside its cloud: `grasped_up` in F,
+`target_up` in W, and both in the common frame of an `Alignment`. It counts where the test and all
+demonstrations have it, and otherwise changes nothing. An aligner may leave it unused.
 """
 
+import inspect
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -60,14 +66,32 @@ class Aligner(Protocol):
         grasped: np.ndarray,
         target: np.ndarray,
         *,
+        grasped_up: np.ndarray | None = None,
+        target_up: np.ndarray | None = None,
         seed: int = 0,
     ) -> PoseEstimate:
         """Aligns `grasped` (P, 3) with `target` (Q, 3) as in `context` (one or more alignments).
 
+        `grasped_up` and `target_up` (3,) are the objects' ways up, None where unknown.
         Deterministic for a seed. Raises `AlignerError` for an empty context, and `CloudError`
-        (`demonstrations.alignment`) for clouds that are empty, not finite or too small.
+        (`demonstrations.alignment`) for clouds that are empty, not finite or too small, and for
+        directions that are no unit vectors.
         """
         ...
+
+
+def check_aligns(aligner: Aligner, name: str) -> None:
+    """Raises `AlignerError` where `aligner.align` can't be called as the protocol says."""
+    align = getattr(aligner, "align", None)
+    try:
+        inspect.signature(align).bind(  # type: ignore[arg-type]  # TypeError where there is none
+            (), None, None, grasped_up=None, target_up=None, seed=0
+        )
+    except TypeError as error:
+        raise AlignerError(
+            f"aligner '{name}': it can't be asked with align(context, grasped, target, *, "
+            f"grasped_up=None, target_up=None, seed=0): {error}; take these arguments, used or not"
+        ) from error
 
 
 def weights_digest(aligner: Aligner) -> str:

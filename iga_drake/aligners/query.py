@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iga_drake.aligners.protocol import PoseEstimate
+from iga_drake.aligners.protocol import Aligner, PoseEstimate
 from iga_drake.demonstrations.alignment import Alignment
 
 
@@ -16,18 +16,56 @@ class Query:
     grasped: np.ndarray  # (P, 3), at `start`
     target: np.ndarray  # (P, 3)
     start: np.ndarray  # (4, 4) from the right place to where the grasped cloud is
+    grasped_up: np.ndarray | None = None  # (3,), turned with the grasped cloud
+    target_up: np.ndarray | None = None  # (3,)
 
     @staticmethod
-    def of(points: np.ndarray, start: np.ndarray) -> "Query":
-        """The query of clouds (2, N, P, 3) m of N aligned pairs, the last one the test pair."""
-        context = tuple(Alignment(A, B) for A, B in zip(*points[:, :-1], strict=True))
-        grasped = points[0, -1] @ start[:3, :3].T + start[:3, 3]
-        return Query(context, grasped, points[1, -1], start)
+    def of(
+        points: np.ndarray,
+        start: np.ndarray,
+        *,
+        grasped_up: np.ndarray | None = None,
+        target_up: np.ndarray | None = None,
+    ) -> "Query":
+        """The query of clouds (2, N, P, 3) m of N aligned pairs, the last one the test pair.
+
+        `grasped_up` and `target_up` (N, 3) are the objects' ways up in the pairs' frames, None
+        where unknown.
+        """
+        context = tuple(
+            Alignment(
+                points[0, n],
+                points[1, n],
+                None if grasped_up is None else grasped_up[n],
+                None if target_up is None else target_up[n],
+            )
+            for n in range(points.shape[1] - 1)
+        )
+        R = start[:3, :3]
+        return Query(
+            context=context,
+            grasped=points[0, -1] @ R.T + start[:3, 3],
+            target=points[1, -1],
+            start=start,
+            grasped_up=None if grasped_up is None else R @ grasped_up[-1],
+            target_up=None if target_up is None else target_up[-1],
+        )
 
     @property
     def clouds(self) -> tuple[tuple[Alignment, ...], np.ndarray, np.ndarray]:
         """The first arguments of `Aligner.align`."""
         return self.context, self.grasped, self.target
+
+    def ask(self, aligner: Aligner, seed: int) -> PoseEstimate:
+        """The aligner's answer."""
+        return aligner.align(
+            self.context,
+            self.grasped,
+            self.target,
+            grasped_up=self.grasped_up,
+            target_up=self.target_up,
+            seed=seed,
+        )
 
     def motion(self, estimate: PoseEstimate) -> np.ndarray:
         """(4, 4) by which the best pose is off, of a cloud in its place: none where it is right."""

@@ -76,11 +76,16 @@ class Observation:
     time: float = 0.0
     # (3,) unit vector that points down, in `frame`, when it was seen.
     gravity: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, -1.0]))
+    # Whether the task always has the object this way up when it is seen: standing, or held alike.
+    # Only then does `up` tell one part of it from another.
+    upright: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", _finite("points", self.points, (None, 3)))
         object.__setattr__(self, "gravity", _finite("gravity", self.gravity, (3,)))
         object.__setattr__(self, "time", float(_finite("time", self.time, ())))
+        if not isinstance(self.upright, bool):
+            raise DemonstrationError(f"upright: {self.upright!r} found, True or False expected")
         for name, value, allowed in (
             ("role", self.role, OBSERVED_ROLES),
             ("frame", self.frame, FRAMES),
@@ -94,6 +99,12 @@ class Observation:
                 f"gravity: {self.gravity} has length {np.linalg.norm(self.gravity):.4g}, a unit "
                 "vector that points down is expected"
             )
+
+    @property
+    def up(self) -> np.ndarray | None:
+        """(3,) unit vector against gravity in `frame`, fixed to the object; None where the object
+        may be any way up."""
+        return -self.gravity if self.upright else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,12 +208,16 @@ class Demonstration:
         return tuple((w.name, w.grasped, w.target) for w in self.waypoints)
 
     def alignment(self, waypoint: int) -> Alignment:
-        """Both clouds in W at a waypoint: the grasped one is carried there by its X_WE."""
+        """Both clouds in W at a waypoint, with the ways up of upright objects: what is in E is
+        carried there by the waypoint's X_WE."""
         at = self.waypoints[waypoint]
-        grasped = self.observations[at.grasped].points
+        grasped, target = self.observations[at.grasped], self.observations[at.target]
+        R_WE, p_WE = at.X_WE[:3, :3], at.X_WE[:3, 3]
         return Alignment(
-            grasped=grasped @ at.X_WE[:3, :3].T + at.X_WE[:3, 3],
-            target=self.observations[at.target].points,
+            grasped=grasped.points @ R_WE.T + p_WE,
+            target=target.points,
+            grasped_up=None if grasped.up is None else R_WE @ grasped.up,
+            target_up=target.up,
         )
 
 

@@ -131,6 +131,7 @@ def _write_one(path: Path, demonstration: Demonstration) -> dict[str, Any]:
                 "frame": observation.frame,
                 "time": observation.time,
                 "gravity": observation.gravity.tolist(),
+                "upright": observation.upright,
                 "points": len(observation.points),
             }
             for name, observation in demonstration.observations.items()
@@ -299,6 +300,8 @@ def _make(where: str, entry: dict[str, Any], arrays: dict[str, np.ndarray]) -> D
                 frame=_check_type(f"{at}.frame", described.get("frame"), str),
                 time=described["time"],
                 gravity=described["gravity"],
+                # Sets recorded before there was this key don't say.
+                upright=_check_type(f"{at}.upright", described.get("upright", False), bool),
             )
         except DemonstrationError as error:
             raise DemonstrationError(f"observation '{name}': {error}") from error

@@ -143,7 +143,7 @@ def evaluate_sample(aligner: Aligner | None, split: str, index: int) -> SampleEr
     else:
         query = Query.of(sample.points, random_pose(index))
         began = time.perf_counter()
-        motion = query.motion(aligner.align(*query.clouds, seed=index))
+        motion = query.motion(query.ask(aligner, index))
     seconds = time.perf_counter() - began
     plain = nearest_error(motion, equivalents(sample, symmetry=False), test)
     modulo = nearest_error(motion, equivalents(sample, symmetry=True), test)

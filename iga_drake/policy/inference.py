@@ -21,7 +21,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from iga_drake.aligners.protocol import Aligner, PoseEstimate
+from iga_drake.aligners.protocol import Aligner, PoseEstimate, check_aligns
 from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.errors import error_text
 from iga_drake.systems.messages import Cause
@@ -51,9 +51,19 @@ class Inference(Protocol):
 
     name: str
 
-    def start(self, waypoint: int, grasped: np.ndarray, target: np.ndarray, seed: int) -> int:
+    def start(
+        self,
+        waypoint: int,
+        grasped: np.ndarray,
+        target: np.ndarray,
+        seed: int,
+        *,
+        grasped_up: np.ndarray | None = None,
+        target_up: np.ndarray | None = None,
+    ) -> int:
         """Asks where the grasped cloud (P, 3) in E has to go, given the target cloud (Q, 3) in W
-        and the context of a waypoint. Returns the question's number and never waits; an earlier
+        and the context of a waypoint; `grasped_up` in E and `target_up` in W (3,) are the objects'
+        ways up, None where unknown. Returns the question's number and never waits; an earlier
         question without an answer is given up."""
         ...
 
@@ -99,9 +109,12 @@ class LocalInference:
         contexts: the alignments of the demonstrations, for each waypoint.
         beside: runs it in a thread beside the caller's, for a policy that doesn't wait. Otherwise
             `poll` runs it and returns when it is done. Neither can be ended early.
+
+    Raises `AlignerError` for an aligner that can't be asked as the protocol says.
     """
 
     def __init__(self, aligner: Aligner, contexts: Contexts, *, beside: bool = False) -> None:
+        check_aligns(aligner, aligner.name)
         self.name = aligner.name
         self._aligner = aligner
         self._contexts = contexts
@@ -111,7 +124,16 @@ class LocalInference:
         self._done = threading.Event()
         self._result: InferenceAnswer | InferenceFailure | None = None
 
-    def start(self, waypoint: int, grasped: np.ndarray, target: np.ndarray, seed: int) -> int:
+    def start(
+        self,
+        waypoint: int,
+        grasped: np.ndarray,
+        target: np.ndarray,
+        seed: int,
+        *,
+        grasped_up: np.ndarray | None = None,
+        target_up: np.ndarray | None = None,
+    ) -> int:
         self._question += 1
         question, done = self._question, threading.Event()
         self._done, self._result = done, None
@@ -120,7 +142,14 @@ class LocalInference:
             began = time.perf_counter()
             result: InferenceAnswer | InferenceFailure
             try:
-                found = self._aligner.align(self._contexts[waypoint], grasped, target, seed=seed)
+                found = self._aligner.align(
+                    self._contexts[waypoint],
+                    grasped,
+                    target,
+                    grasped_up=grasped_up,
+                    target_up=target_up,
+                    seed=seed,
+                )
                 result = checked_answer(self.name, found, time.perf_counter() - began)
             except KeyboardInterrupt:
                 raise
@@ -173,7 +202,8 @@ class WorkerInference:
         self.name = aligner
         self._options = dict(options)
         self._contexts = [
-            [(alignment.grasped, alignment.target) for alignment in context] for context in contexts
+            [(a.grasped, a.target, a.grasped_up, a.target_up) for a in context]
+            for context in contexts
         ]
         self._question = 0
         self._process: subprocess.Popen | None = None
@@ -209,7 +239,16 @@ class WorkerInference:
         """The worker's process id; None while there is no worker."""
         return None if self._process is None else self._process.pid
 
-    def start(self, waypoint: int, grasped: np.ndarray, target: np.ndarray, seed: int) -> int:
+    def start(
+        self,
+        waypoint: int,
+        grasped: np.ndarray,
+        target: np.ndarray,
+        seed: int,
+        *,
+        grasped_up: np.ndarray | None = None,
+        target_up: np.ndarray | None = None,
+    ) -> int:
         self._question += 1
         if self._pending or (self._process is not None and self._process.poll() is not None):
             self.close()
@@ -221,6 +260,8 @@ class WorkerInference:
                 "waypoint": waypoint,
                 "grasped": np.asarray(grasped),
                 "target": np.asarray(target),
+                "grasped_up": grasped_up,
+                "target_up": target_up,
                 "seed": seed,
             }
         )

@@ -72,6 +72,10 @@ class PolicyConfig:
     infer_limit: float = 60.0
     # Least `PoseEstimate.familiarity`, in [0, 1]: below it the policy refuses. 0 refuses nothing.
     minimum_familiarity: float = 0.0
+    # Whether aligners are told which way is up for the objects that the task says are upright
+    # (`ObservationPlan.upright`), where all demonstrations say so too. To be switched off where
+    # such objects may lie on their side; demonstrations recorded then don't call them upright.
+    up: bool = True
 
     def check(self, where: str = "policy") -> None:
         """Raises `ConfigError` for a value out of range."""
@@ -279,7 +283,12 @@ class PolicyMachine:
         """Adds a cloud, `points` (P, 3) in the plan's frame, to what was observed."""
         gravity = DOWN_W if plan.frame == "W" else inputs.pose().rotation().matrix().T @ DOWN_W
         seen = Observation(
-            points=points, role=plan.role, frame=plan.frame, time=now, gravity=gravity
+            points=points,
+            role=plan.role,
+            frame=plan.frame,
+            time=now,
+            gravity=gravity,
+            upright=plan.upright and self.config.up,
         )
         return replace(
             memory, observations=MappingProxyType({**memory.observations, plan.name: seen})
@@ -341,9 +350,16 @@ class PolicyMachine:
         waypoint = self.motion.waypoints[index]
         if memory.question is None:
             grasped, target = (
-                memory.observations[name].points for name in (waypoint.grasped, waypoint.target)
+                memory.observations[name] for name in (waypoint.grasped, waypoint.target)
             )
-            question = self.inference.start(index, grasped, target, self._seed)
+            question = self.inference.start(
+                index,
+                grasped.points,
+                target.points,
+                self._seed,
+                grasped_up=self._known_up(waypoint.grasped, grasped),
+                target_up=self._known_up(waypoint.target, target),
+            )
             memory = replace(memory, question=question, asked=wall.perf_counter())
         assert memory.question is not None
         left = config.infer_limit - (wall.perf_counter() - memory.asked)
@@ -393,6 +409,13 @@ class PolicyMachine:
             f"{seconds:.2f} s"
         )
         return self._continue(memory, inputs, now, detail)
+
+    def _known_up(self, name: str, seen: Observation) -> np.ndarray | None:
+        """The way up (3,) of what was observed; None unless all demonstrations know theirs."""
+        if self._demonstrations is None:
+            return None
+        shown = [d.observations[name] for d in self._demonstrations.demonstrations]
+        return seen.up if all(observation.upright for observation in shown) else None
 
     def _start_move(self, memory: PolicyMemory, now: float, detail: str) -> PolicyMemory:
         index = memory.followed

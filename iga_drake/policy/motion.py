@@ -99,6 +99,9 @@ class ObservationPlan:
     # joint angles (7,) (rad) near which to be there.
     present: RigidTransform | None = None
     present_posture: np.ndarray | None = None
+    # Whether the object always stands, or is held, the same way up when it is observed: then
+    # aligners are told which way that is (`PolicyConfig.up`).
+    upright: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,8 +44,7 @@ def main(descriptor: int) -> None:
         from iga_drake.demonstrations.alignment import Alignment
 
         contexts = [
-            tuple(Alignment(grasped, target) for grasped, target in context)
-            for context in first["contexts"]
+            tuple(Alignment(*alignment) for alignment in context) for context in first["contexts"]
         ]
         aligner = make_aligner(first["aligner"], **first["options"])
     except Exception as error:
@@ -60,6 +59,8 @@ def main(descriptor: int) -> None:
                     contexts[asked["waypoint"]],
                     asked["grasped"],
                     asked["target"],
+                    grasped_up=asked["grasped_up"],
+                    target_up=asked["target_up"],
                     seed=asked["seed"],
                 )
                 familiarity = estimate.familiarity

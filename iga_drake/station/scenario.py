@@ -24,6 +24,7 @@ from iga_drake.errors import IgaDrakeError, check_range
 from iga_drake.paths import diagrams_dir
 from iga_drake.planning.planning_robot import PlanningConfig
 from iga_drake.policy.machine import PolicyConfig
+from iga_drake.station.cameras.clutter import Clutter
 from iga_drake.station.cameras.kinds import camera_type
 from iga_drake.station.cameras.rgbd import LookAt, RgbdCamera
 from iga_drake.systems.differential_ik import DifferentialIkConfig
@@ -143,6 +144,8 @@ class Scenario:
     # Name -> camera of any kind, at least one. A file that has this section states all cameras it
     # wants; what is no plain RGB-D camera has a tag, the name of its kind's class.
     cameras: dict[str, RgbdCamera] = field(default_factory=_cameras)
+    # Errors of the simulated cameras at the objects: masks that leak, stray depth.
+    clutter: Clutter = field(default_factory=Clutter)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     planning: PlanningConfig = field(default_factory=PlanningConfig)
     control: WaypointFollowerConfig = field(default_factory=WaypointFollowerConfig)
@@ -383,6 +386,7 @@ def _check_values(s: Scenario) -> None:
     check_range(len(s.cameras) > 0, "cameras", s.cameras, "at least one camera")
     for name, camera in s.cameras.items():
         camera.check(f"cameras.{name}")
+    s.clutter.check("clutter")
     s.fusion.check("fusion")
     s.planning.check("planning")
     s.control.check("control")

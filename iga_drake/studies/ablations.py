@@ -233,9 +233,11 @@ class EnergyAlone:
         grasped: np.ndarray,
         target: np.ndarray,
         *,
+        grasped_up: np.ndarray | None = None,
+        target_up: np.ndarray | None = None,
         seed: int = 0,
     ) -> PoseEstimate:
-        """See `Aligner.align`."""
+        """See `Aligner.align`. Ways up are not used."""
         seen = self._aligner.explain(context, grasped, target, seed=seed)
         nodes = seen.nodes[:, -1] - seen.centres[:, None]
         voting = self._aligner.voting

@@ -38,7 +38,7 @@ class Busy:
     def __init__(self, seconds=2.0):
         self.seconds = seconds
 
-    def align(self, context, grasped, target, *, seed=0):
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
         end, matrix = time.perf_counter() + self.seconds, np.eye(300)
         while time.perf_counter() < end:
             matrix = matrix @ matrix

@@ -273,7 +273,7 @@ def compare(
             sample = in_common_frames(sample)
         query = Query.of(sample.points, random_pose(index))
         began = time.perf_counter()
-        motion = query.motion(entry.aligner.align(*query.clouds, seed=index))
+        motion = query.motion(query.ask(entry.aligner, index))
         seconds.append(time.perf_counter() - began)
         valid = equivalents(sample, symmetry=True)
         rows.append(nearest_error(motion, valid, sample.points[0, -1]))

@@ -84,7 +84,7 @@ def measure_familiarity(aligner: Aligner, split: str, count: int) -> Familiarity
         mixed = foreign_points(points, foreign_sample(split, index, CONFIG).points, index)
         for asked, values in ((points, own), (mixed, foreign)):
             query = Query.of(asked, random_pose(index))
-            familiarity = aligner.align(*query.clouds, seed=index).familiarity
+            familiarity = query.ask(aligner, index).familiarity
             if familiarity is None:
                 raise IgaDrakeError(
                     f"aligner {aligner.name}: gives no familiarity: use iga with a trained energy"

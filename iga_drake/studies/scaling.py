@@ -265,7 +265,7 @@ def diversity_errors(
     for index in range(count):
         problem = Problem.of(split, index)
         for n in numbers:
-            estimate = aligner.align(*problem.with_first(n).query.clouds, seed=index)
+            estimate = problem.with_first(n).query.ask(aligner, index)
             errors[n].append(problem.error(estimate.poses[0]))
     return [
         DiversityErrors(split, n, count, Errors.of(*np.array(values).T))

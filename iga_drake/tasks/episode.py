@@ -190,7 +190,16 @@ class ExpertInference:
         self._poses = poses
         self._waypoint = 0
 
-    def start(self, waypoint: int, grasped: np.ndarray, target: np.ndarray, seed: int) -> int:
+    def start(
+        self,
+        waypoint: int,
+        grasped: np.ndarray,
+        target: np.ndarray,
+        seed: int,
+        *,
+        grasped_up: np.ndarray | None = None,
+        target_up: np.ndarray | None = None,
+    ) -> int:
         """See `Inference.start`."""
         self._waypoint = waypoint
         return 0

@@ -48,7 +48,7 @@ class Grasp(Task):
     motion = TaskMotion(
         observations=(
             ObservationPlan(name="gripper", role="gripper", frame="E"),
-            ObservationPlan(name="pan", role="target", frame="W"),
+            ObservationPlan(name="pan", role="target", frame="W", upright=True),
         ),
         waypoints=(
             WaypointMotion(

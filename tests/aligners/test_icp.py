@@ -1,11 +1,12 @@
 """ICP on objects that it has seen: the exact pose comes back."""
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from iga_drake.aligners.icp import IcpAligner
 from iga_drake.dataset.samples import make_sample
-from iga_drake.demonstrations.alignment import Alignment
+from iga_drake.demonstrations.alignment import Alignment, CloudError
 
 
 def test_the_same_objects_moved_are_put_back() -> None:
@@ -18,3 +19,33 @@ def test_the_same_objects_moved_are_put_back() -> None:
         (Alignment(A, B),), A @ G[:3, :3].T + G[:3, 3], B, seed=0
     )
     np.testing.assert_allclose(estimate.poses[0] @ G, np.eye(4), atol=2e-3)
+
+
+def _brick(rng: np.random.Generator) -> np.ndarray:
+    """Points of a brick's surface: it looks the same after half a turn about any of its axes."""
+    points = rng.uniform(-1, 1, (600, 3))
+    side = rng.integers(3, size=600)
+    points[np.arange(600), side] = np.sign(points[np.arange(600), side])
+    return points * [0.06, 0.04, 0.025]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_way_up_tells_top_from_bottom(seed: int) -> None:
+    """A ball-like thing lies on the brick's top; the test's brick is turned anyhow, up with it."""
+    rng = np.random.default_rng(seed)
+    thing = 0.03 * rng.normal(size=(300, 3)) * [1.0, 0.6, 0.4]
+    up = np.array([0.0, 0.0, 1.0])
+    shown = Alignment(thing + [0, 0, 0.06], _brick(rng), target_up=up)
+    R = Rotation.random(rng=rng).as_matrix()
+    p = rng.normal(size=3)
+    estimate = IcpAligner(starts=12).align(
+        (shown,), thing, _brick(rng) @ R.T + p, target_up=R @ up, seed=seed
+    )
+    assert len(estimate.poses) == 1
+    np.testing.assert_allclose(R.T @ (estimate.poses[0, :3, 3] - p), [0, 0, 0.06], atol=0.01)
+
+
+def test_a_way_up_of_another_length_is_refused() -> None:
+    cloud = _brick(np.random.default_rng(0))
+    with pytest.raises(CloudError, match=r"target_up: .*length 2"):
+        IcpAligner().align((Alignment(cloud, cloud),), cloud, cloud, target_up=np.array([0, 0, 2]))

@@ -1,4 +1,4 @@
-"""Clouds and estimates are checked at the boundary."""
+"""Clouds, directions and estimates are checked at the boundary."""
 
 from pathlib import Path
 
@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from paper_networks import untrained
 
-from iga_drake.aligners.protocol import AlignerError, PoseEstimate
+from iga_drake.aligners.protocol import AlignerError, PoseEstimate, check_aligns
 from iga_drake.aligners.registry import aligner_names, make_aligner
-from iga_drake.demonstrations.alignment import Alignment, CloudError, check_cloud
+from iga_drake.demonstrations.alignment import Alignment, CloudError, check_cloud, check_direction
 
 PAPER = ("iga-paper", "dirreg", "dfm")
 CLOUD = np.random.default_rng(0).normal(size=(64, 3)) * 0.05
@@ -30,6 +30,33 @@ def test_bad_clouds_are_named(cloud: np.ndarray, message: str) -> None:
 def test_an_alignment_checks_both_clouds() -> None:
     with pytest.raises(CloudError, match=r"Alignment\.target"):
         Alignment(CLOUD, CLOUD[:3])
+
+
+def test_directions_are_optional_and_get_length_one() -> None:
+    plain = Alignment(CLOUD, CLOUD)
+    assert plain.grasped_up is None and plain.target_up is None
+    given = Alignment(CLOUD, CLOUD, target_up=np.array([0.0, 0.6003, 0.8004]))
+    np.testing.assert_allclose(given.target_up, [0, 0.6, 0.8], atol=1e-12)
+    assert np.linalg.norm(given.target_up) == pytest.approx(1, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("direction", "message"),
+    [
+        ([0.0, 0.0, 9.81], r"length 9.81, expected a unit vector"),
+        ([0.0, 0.0, 0.0], r"length 0, expected a unit vector"),
+        ([0.0, 0.0, 1.002], r"length 1.002"),
+        ([0.0, np.nan, 1.0], r"length nan"),
+        ([0.0, np.inf, 1.0], r"length inf"),
+        ([0.0, 1.0], r"shape \(3,\), got \(2,\)"),
+        (np.eye(3), r"shape \(3,\), got \(3, 3\)"),
+    ],
+)
+def test_what_is_no_direction_is_refused_by_name(direction, message: str) -> None:
+    with pytest.raises(CloudError, match=f"target_up: .*{message}"):
+        check_direction(direction, "target_up")
+    with pytest.raises(CloudError, match=f"Alignment.grasped_up: .*{message}"):
+        Alignment(CLOUD, CLOUD, grasped_up=direction)
 
 
 def test_an_estimate_needs_poses_of_one_length() -> None:
@@ -56,3 +83,27 @@ def test_every_aligner_refuses_bad_input(name: str, tmp_path: Path) -> None:
         aligner.align(context, CLOUD[:2], CLOUD)
     with pytest.raises(CloudError, match="target"):
         aligner.align(context, CLOUD, np.full((40, 3), np.inf))
+
+
+@pytest.mark.parametrize("name", [name for name in aligner_names() if name not in PAPER])
+def test_ways_up_that_are_not_known_of_all_change_nothing(name: str) -> None:
+    aligner = make_aligner(name)
+    up = np.array([0.6, 0.0, 0.8])
+    plain, known = Alignment(CLOUD, CLOUD), Alignment(CLOUD, CLOUD, up, up)
+    expected = aligner.align((plain, plain), CLOUD, CLOUD)
+    for context, ups in (
+        ((known, known), {}),
+        ((plain, known), {"grasped_up": up, "target_up": up}),
+    ):
+        found = aligner.align(context, CLOUD, CLOUD, **ups)
+        np.testing.assert_array_equal(found.poses, expected.poses)
+
+
+def test_what_cannot_be_asked_as_the_protocol_says_is_refused() -> None:
+    class Old:
+        def align(self, context, grasped, target, *, seed=0): ...
+
+    for wrong in (Old(), object()):
+        with pytest.raises(AlignerError, match=r"aligner 'old': it can't be asked with align"):
+            check_aligns(wrong, "old")
+    check_aligns(make_aligner("icp"), "icp")

@@ -35,6 +35,33 @@ def test_the_context_carries_the_grasped_cloud_into_the_world():
         demonstrations.context(2)
 
 
+def test_ways_up_are_carried_with_their_clouds():
+    """One demonstration and the same with everything turned: the ways up turn along."""
+    made = {
+        name: replace(seen, upright=name != "gripper") for name, seen in make_observations().items()
+    }
+    (_, one), (_, other) = (
+        DemonstrationSet("t", (make_demonstration(observations=made, waypoints=way),)).contexts
+        for way in (make_waypoints(), make_waypoints(5))
+    )
+    for context in (one, other):
+        np.testing.assert_array_equal(context[0].target_up, [0, 0, 1])
+    # The held thing hung from a hand whose z axis pointed down: its up is against that axis.
+    for context, seed in ((one, 0), (other, 5)):
+        X_WE = make_waypoints(seed)[1].X_WE
+        np.testing.assert_allclose(context[0].grasped_up, -X_WE[:3, 2], atol=1e-12)
+        # Fixed to the cloud: heights along it are those above the hand.
+        heights = context[0].grasped @ context[0].grasped_up
+        seen = -made["thing in the hand"].points[:, 2]
+        np.testing.assert_allclose(np.diff(heights), np.diff(seen), atol=1e-7)
+
+
+def test_what_may_be_any_way_up_has_no_way_up():
+    assert all(seen.up is None for seen in make_observations().values())
+    for context in make_set().contexts:
+        assert context[0].grasped_up is None and context[0].target_up is None
+
+
 def test_contexts_are_made_once():
     demonstrations = make_set()
     assert demonstrations.context(1) is demonstrations.contexts[1]
@@ -70,6 +97,7 @@ def test_arrays_are_copies():
         (lambda: replace(make_observations()["goal"], points=[["a"]]), "not an array of numbers"),
         (lambda: replace(make_observations()["goal"], role="lid"), "role: 'lid' found, one of"),
         (lambda: replace(make_observations()["goal"], gravity=[0, 0, 9.81]), "unit vector"),
+        (lambda: replace(make_observations()["goal"], upright="yes"), "upright: 'yes' found"),
         (lambda: replace(make_waypoints()[0], X_WE=2 * np.eye(4)), "not a rigid transform"),
         (lambda: replace(make_waypoints()[0], X_WE=np.diag([1.0, 1, -1, 1])), "not a rigid"),
         (lambda: replace(make_waypoints()[0], opening=np.inf), "finite"),

@@ -1,5 +1,6 @@
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from iga_drake.demonstrations.demonstration import (
     Provenance,
 )
 from iga_drake.demonstrations.store import MANIFEST, read_demonstrations, write_demonstrations
+from iga_drake.paths import models_dir
+from iga_drake.tasks.registry import make_task
 
 
 @pytest.fixture
@@ -48,7 +51,7 @@ def test_round_trip_keeps_every_value(folder: Path):
             found = read.observations[name]
             np.testing.assert_array_equal(found.points, observation.points)
             np.testing.assert_array_equal(found.gravity, observation.gravity)
-            for field in ("role", "frame", "time"):
+            for field in ("role", "frame", "time", "upright"):
                 assert getattr(found, field) == getattr(observation, field)
         assert read.relations == wrote.relations
         for before, after in zip(wrote.waypoints, read.waypoints, strict=True):
@@ -59,6 +62,38 @@ def test_round_trip_keeps_every_value(folder: Path):
                 getattr(wrote.trajectory, field), getattr(read.trajectory, field)
             )
         assert read.provenance == wrote.provenance
+
+
+def test_uprightness_is_kept_and_may_be_missing(tmp_path: Path):
+    seen = make_demonstration().observations
+    seen = {name: replace(seen[name], upright=name in ("thing", "goal")) for name in seen}
+    write_demonstrations(
+        tmp_path / "set", DemonstrationSet("t", (make_demonstration(observations=seen),))
+    )
+    (read,) = read_demonstrations(tmp_path / "set").demonstrations
+    for name, observation in read.observations.items():
+        assert observation.upright == seen[name].upright
+    np.testing.assert_array_equal(read.observations["goal"].up, [0, 0, 1])
+    # As recorded before there was the key.
+    manifest = json.loads((tmp_path / "set" / MANIFEST).read_text())
+    for described in manifest["demonstrations"][0]["observations"].values():
+        del described["upright"]
+    edit_manifest(tmp_path / "set", demonstrations=manifest["demonstrations"])
+    (old,) = read_demonstrations(tmp_path / "set").demonstrations
+    assert not any(observation.upright for observation in old.observations.values())
+
+
+@pytest.mark.parametrize("task", ["grasp", "stack"])
+def test_landed_demonstrations_are_upright_as_their_task_says(task: str):
+    plans = make_task(task).motion.observations
+    read = read_demonstrations(models_dir() / "demonstrations" / task, task=task)
+    assert len(read) == 5
+    for demonstration in read.demonstrations:
+        for plan in plans:
+            assert demonstration.observations[plan.name].upright == plan.upright
+    for alignment in read.context(0):
+        np.testing.assert_array_equal(alignment.target_up, [0, 0, 1])
+        assert alignment.grasped_up is None
 
 
 def test_a_trajectory_may_be_missing(tmp_path: Path):
@@ -215,6 +250,7 @@ def test_a_file_outside_the_folder_is_refused(folder: Path):
         (("observations", "goal", "role"), 3, "role: int found"),
         (("observations", "goal", "gravity"), [0, 0, -2], "gravity: .*unit vector"),
         (("observations", "goal", "time"), "noon", "time: str found"),
+        (("observations", "goal", "upright"), 1, "upright: int found, bool expected"),
         (("observations", "goal", "points"), 81, "80 points found, the manifest says 81"),
         (("waypoints",), [], "2 poses, 2 openings and 0 described"),
         (("waypoints", 0, "grasped"), "spoon", "relates the grasped observation 'spoon'"),

@@ -56,7 +56,7 @@ class _Fixed:
         self.motion = motion
         self.calls = 0
 
-    def align(self, context, grasped, target, *, seed=0):
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
         self.calls += 1
         return PoseEstimate((self.motion @ np.linalg.inv(random_pose(seed)))[None], [0.0], [1.0])
 

@@ -57,9 +57,11 @@ class FakeAligner:
     error: BaseException | None = None
     familiarity: float | None = None
     calls: list = field(default_factory=list)
+    ups: list = field(default_factory=list)
 
-    def align(self, context, grasped, target, *, seed=0):
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
         self.calls.append((context, grasped, target, seed))
+        self.ups.append((grasped_up, target_up))
         if self.error:
             raise self.error
         matrices = np.stack([X.GetAsMatrix4() for X in self.poses])
@@ -100,23 +102,34 @@ class FakeInputs:
         return self.supervisor_status
 
 
-def make_demonstrations(motion=GRASP, openings=(0.01, 0.06)) -> DemonstrationSet:
-    """One demonstration with the waypoints of `motion`."""
-    observations = {
-        plan.name: Observation(
-            points=GRIPPER if plan.frame == "E" else TARGET, role=plan.role, frame=plan.frame
-        )
-        for plan in motion.observations
-    }
+def make_demonstrations(motion=GRASP, openings=(0.01, 0.06), upright=(True,)) -> DemonstrationSet:
+    """Demonstrations with the waypoints of `motion`: for each of `upright` one, in which what the
+    plans call upright is so or isn't."""
     waypoints = tuple(
         Waypoint(w.name, np.eye(4), opening, grasped=w.grasped, target=w.target)
         for w, opening in zip(motion.waypoints, openings, strict=False)
     )
-    return DemonstrationSet("grasp", (Demonstration(observations, waypoints),))
+
+    def observations(upright: bool) -> dict[str, Observation]:
+        return {
+            plan.name: Observation(
+                points=GRIPPER if plan.frame == "E" else TARGET,
+                role=plan.role,
+                frame=plan.frame,
+                upright=plan.upright and upright,
+            )
+            for plan in motion.observations
+        }
+
+    return DemonstrationSet(
+        "grasp", tuple(Demonstration(observations(each), waypoints) for each in upright)
+    )
 
 
-def make_machine(motion=GRASP, aligner=None, solve=None, service=None, seed=0, **config):
-    demonstrations = make_demonstrations(motion)
+def make_machine(
+    motion=GRASP, aligner=None, solve=None, service=None, seed=0, upright=(True,), **config
+):
+    demonstrations = make_demonstrations(motion, upright=upright)
     return PolicyMachine(
         motion=motion,
         inference=service or LocalInference(aligner or FakeAligner(), demonstrations.contexts),

@@ -14,7 +14,9 @@ import pytest
 from outside_package import install
 from policy_fakes import GRIPPER, TARGET, make_demonstrations
 
+from iga_drake.aligners.protocol import AlignerError
 from iga_drake.aligners.registry import make_aligner
+from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.policy.inference import InferenceFailure, LocalInference, WorkerInference
 from iga_drake.systems.messages import Cause
 
@@ -32,7 +34,7 @@ class Outside:
     def __init__(self, offset=0.0):
         self.offset, self.count = offset, 0
 
-    def align(self, context, grasped, target, *, seed=0):
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
         self.count += 1
         if seed == 1:
             time.sleep(60.0)
@@ -44,6 +46,9 @@ class Outside:
             raise ValueError("no such luck")
         if seed == 5:
             return None
+        if seed == 6:
+            ups = [context[0].grasped_up, context[0].target_up, grasped_up, target_up]
+            raise ValueError("ways up: " + str([None if u is None else list(u) for u in ups]))
         print("a word on the way", flush=True)
         X = np.eye(4)
         X[:3, 3] = target.mean(0) + [self.offset, 0.1 * self.count, len(context)]
@@ -90,6 +95,37 @@ def test_the_answer_is_that_of_the_aligner_itself(outside, capfd):
 def test_the_aligner_is_loaded_once(worker):
     heights = [ask(worker).estimate.poses[0, 1, 3] for _ in range(3)]
     np.testing.assert_allclose(np.diff(heights), 0.1)
+
+
+def test_ways_up_of_context_and_question_come_to_the_aligner(outside):
+    x, y, z = np.eye(3)
+    context = (Alignment(GRIPPER, TARGET, target_up=y),)
+    found = []
+    worker = WorkerInference("outside", {}, [context])
+    for inference in (worker, LocalInference(make_aligner("outside"), [context])):
+        for ups in ({}, {"grasped_up": x, "target_up": z}):
+            question = inference.start(0, GRIPPER, TARGET, 6, **ups)
+            with pytest.raises(InferenceFailure) as failure:
+                inference.poll(question, 30.0)
+            found.append(str(failure.value).replace("np.float64", "").partition("ways up: ")[2])
+        inference.close()
+    without = "[None, [(0.0), (1.0), (0.0)], None, None]"
+    told = "[None, [(0.0), (1.0), (0.0)], [(1.0), (0.0), (0.0)], [(0.0), (0.0), (1.0)]]"
+    assert found == [without, told, without, told]
+
+
+class _Old:
+    """Written for the protocol before there were ways up."""
+
+    name = "old"
+
+    def align(self, context, grasped, target, *, seed=0):
+        raise AssertionError("never asked")
+
+
+def test_an_aligner_that_takes_no_ways_up_is_refused_at_once():
+    with pytest.raises(AlignerError, match=r"'old'.*grasped_up=None.*got an unexpected keyword"):
+        LocalInference(_Old(), make_demonstrations().contexts)
 
 
 def test_looking_for_an_answer_does_not_wait(worker):

@@ -82,6 +82,43 @@ def test_stack_presents_the_held_object_and_carries_it_into_the_hand_frame():
     assert held.time > memory.observations["goal"].time == pytest.approx(0.5)
 
 
+def _upright(motion: TaskMotion) -> TaskMotion:
+    plans = tuple(replace(plan, upright=plan.role != "gripper") for plan in motion.observations)
+    return replace(motion, observations=plans)
+
+
+def test_ways_up_are_told_in_the_frames_of_the_clouds():
+    aligner, inputs = FakeAligner(), FakeInputs()
+    memory, _ = run(make_machine(_upright(PICK_AND_PLACE), aligner), inputs)
+    (gripper_up, thing_up), (held_up, goal_up) = aligner.ups
+    assert gripper_up is None
+    np.testing.assert_array_equal(thing_up, [0, 0, 1])
+    np.testing.assert_array_equal(goal_up, [0, 0, 1])
+    # The hand showed it pointing down.
+    np.testing.assert_allclose(held_up, X_PRESENT.rotation().inverse() @ [0, 0, 1], atol=1e-12)
+    context = aligner.calls[1][0]
+    np.testing.assert_array_equal(context[0].target_up, [0, 0, 1])
+    assert {name: seen.upright for name, seen in memory.observations.items()} == {
+        "gripper": False, "pan": True, "held": True, "goal": True
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("motion", "options"),
+    [
+        (STACK, {}),  # the task doesn't say that anything is upright
+        (_upright(STACK), {"upright": (True, False)}),  # a demonstration doesn't
+        (_upright(STACK), {"up": False}),  # switched off
+    ],
+)
+def test_ways_up_are_not_told_where_one_is_not_known(motion: TaskMotion, options: dict):
+    aligner = FakeAligner()
+    memory, _ = run(make_machine(motion, aligner, **options), FakeInputs())
+    assert aligner.ups == [(None, None)]
+    seen_upright = motion != STACK and options.get("up", True)
+    assert memory.observations["goal"].upright == seen_upright
+
+
 def test_pick_and_place_goes_back_from_moving_to_observing():
     aligner, inputs = FakeAligner(), FakeInputs()
     machine = make_machine(PICK_AND_PLACE, aligner)

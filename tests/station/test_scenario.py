@@ -12,7 +12,7 @@ from iga_drake.station.scenario import (
     load_scenario,
 )
 
-SHIPPED = ("grasp", "stack", "one_of_everything")
+SHIPPED = ("grasp", "stack", "field", "one_of_everything")
 
 
 def _load(tmp_path, text: str) -> Scenario:
@@ -43,6 +43,15 @@ def test_task_scenarios_differ_in_the_task_only():
     assert grasp.camera_names == ("camera_0", "camera_1", "camera_2")
     stack.task, stack.demonstrations = grasp.task, grasp.demonstrations
     assert stack.to_yaml() == grasp.to_yaml()
+
+
+@pytest.mark.parametrize("name", ["grasp", "stack"])
+def test_field_adds_clutter_and_nothing_else(name):
+    plain, field = load_scenario(name), load_scenario(name, "field")
+    assert not plain.clutter.any
+    assert (field.clutter.ring, field.clutter.stray) == (0.06, 0.05)
+    field.clutter = plain.clutter
+    assert field.to_yaml() == plain.to_yaml()
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -169,6 +178,7 @@ def test_wrong_type_names_the_key(tmp_path, text, where):
         ("cameras: {a: {calibration: {minimum: 0.1}}}", "calibration.minimum"),
         ("cameras: {a: {calibration: {rotation: 1}}}", "calibration.rotation"),
         ("fusion: {crop_lower: [9, 9, 9]}", "fusion.crop_lower"),
+        ("clutter: {stray: 1}", "clutter.stray"),
         ("fusion: {erosion: -1}", "fusion.erosion"),
         ("differential_ik: {velocity_scale: 1.5}", "differential_ik.velocity_scale"),
         ("policy: {infer_limit: 0}", "policy.infer_limit"),
@@ -263,5 +273,5 @@ def test_the_digest_is_of_what_is_said_not_of_the_file(tmp_path):
 
 def test_names_of_shipped_files_are_found_and_unknown_ones_listed():
     assert load_scenario("stack").task.name == load_scenario("stack.yaml").task.name == "stack"
-    with pytest.raises(ScenarioError, match="no such file; name a YAML file or one of: grasp"):
+    with pytest.raises(ScenarioError, match="name a YAML file or one of: field, grasp"):
         load_scenario("sweep_the_floor")

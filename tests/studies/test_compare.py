@@ -60,7 +60,7 @@ class _Knowing:
 
     name = "knowing"
 
-    def align(self, context, grasped, target, *, seed: int = 0) -> PoseEstimate:
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
         X = np.linalg.inv(random_pose(seed))
         X[0, 3] += 0.01
         return PoseEstimate(X[None], np.zeros(1), np.ones(1))

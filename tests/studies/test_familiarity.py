@@ -18,7 +18,7 @@ class Asked:
     def __init__(self, *values: float | None):
         self.values = list(values)
 
-    def align(self, context, grasped, target, *, seed=0):
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
         return PoseEstimate(np.eye(4)[None], np.zeros(1), np.ones(1), self.values.pop(0))
 
 

@@ -35,7 +35,7 @@ class FixedAligner:
     X_WE: RigidTransform
     name: str = "fixed"
 
-    def align(self, context, grasped, target, *, seed=0):
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
         return PoseEstimate(self.X_WE.GetAsMatrix4()[None], np.zeros(1), np.ones(1))
 
 
@@ -148,7 +148,7 @@ class Unruly:
     def __init__(self, way):
         self.way = way
 
-    def align(self, context, grasped, target, *, seed=0):
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
         if self.way == "hangs":
             time.sleep(600.0)
         if self.way == "crashes":
@@ -211,6 +211,7 @@ def test_the_expert_steps_restarts_and_leaves_a_demonstration(scenario: Scenario
     assert demonstration.provenance.instances["target"].startswith("pan ")
     pan = demonstration.observations["pan"]
     np.testing.assert_array_equal(pan.points, result.observations["pan"].points)
+    assert pan.upright and not demonstration.observations["gripper"].upright
     # The trajectory passes the waypoint, and ends lifted.
     gaps = np.linalg.norm(demonstration.trajectory.X_WE[:, :3, 3] - reached.X_WE[:3, 3], axis=1)
     assert gaps.min() < 0.01 and gaps[-1] > 0.1

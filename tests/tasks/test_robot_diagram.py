@@ -104,7 +104,7 @@ class Above:
 
     name = "above"
 
-    def align(self, context, grasped, target, *, seed=0):
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
         X = np.diag([1.0, -1.0, -1.0, 1.0])
         X[:3, 3] = target.mean(0) + [0, 0, 0.12]
         return PoseEstimate(X[None], np.zeros(1), np.ones(1))

@@ -16,7 +16,7 @@ class _Off:
     def __init__(self) -> None:
         self.sizes: list[int] = []
 
-    def align(self, context, grasped, target, *, seed=0):
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
         self.sizes.append(len(context))
         motion = np.eye(4)
         motion[1, 3] = 1e-3 * seed**2

@@ -151,6 +151,8 @@ class IgaAligner:
         grasped: np.ndarray,
         target: np.ndarray,
         *,
+        grasped_up: np.ndarray | None = None,
+        target_up: np.ndarray | None = None,
         seed: int = 0,
     ) -> PoseEstimate:
         """See `Aligner.align`."""

@@ -185,10 +185,12 @@ class IgaPaperAligner:
         grasped: np.ndarray,
         target: np.ndarray,
         *,
+        grasped_up: np.ndarray | None = None,
+        target_up: np.ndarray | None = None,
         seed: int = 0,
     ) -> PoseEstimate:
-        """See `Aligner.align`. The modes share the rotation; energies are the translation
-        network's."""
+        """See `Aligner.align`. Ways up are not used. The modes share the rotation; energies are the
+        translation network's."""
         config, generator = self.config, torch.Generator().manual_seed(seed)
         options = {"points": config.points, "seed": seed, "name": self.name}
         asked = Asked.of(self.rotation, context, grasped, target, **options)  # type: ignore[arg-type]

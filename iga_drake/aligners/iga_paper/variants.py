@@ -53,9 +53,11 @@ class DirRegAligner:
         grasped: np.ndarray,
         target: np.ndarray,
         *,
+        grasped_up: np.ndarray | None = None,
+        target_up: np.ndarray | None = None,
         seed: int = 0,
     ) -> PoseEstimate:
-        """See `Aligner.align`."""
+        """See `Aligner.align`. Ways up are not used."""
         asked = Asked.of(
             self.model, context, grasped, target,
             points=self.config.points, seed=seed, name=self.name,
@@ -115,9 +117,11 @@ class DfmAligner:
         grasped: np.ndarray,
         target: np.ndarray,
         *,
+        grasped_up: np.ndarray | None = None,
+        target_up: np.ndarray | None = None,
         seed: int = 0,
     ) -> PoseEstimate:
-        """See `Aligner.align`."""
+        """See `Aligner.align`. Ways up are not used."""
         config = self.config
         asked = Asked.of(
             self.model, context, grasped, target,

@@ -15,7 +15,8 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import MatrixGain
 
 from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
-from iga_drake.station.cameras.rgbd import add_renderer
+from iga_drake.station.cameras.clutter import CameraClutter
+from iga_drake.station.cameras.rgbd import add_renderer, camera_info
 from iga_drake.station.contract import CHEAT, StationError
 from iga_drake.station.panda.command import PandaCommand
 from iga_drake.station.panda.model import PandaModel, Visuals, add_panda
@@ -38,7 +39,8 @@ def build_simulation_station(
     `station.GetSubsystemByName("plant")`; objects are its model instances by their names.
 
     Args:
-      seed: >= 0; draws camera noise and calibration errors, with `scenario.seeds.cameras` added.
+      seed: >= 0; draws camera noise, clutter and calibration errors, with `scenario.seeds.cameras`
+        added.
       meshcat: where to show the scene; None shows nothing.
 
     Raises:
@@ -68,6 +70,18 @@ def build_simulation_station(
         segmentation = builder.AddNamedSystem(f"{name}.segmentation", Segmentation(roles, **size))
         builder.Connect(ports["label_image"], segmentation.get_input_port())
         ports["label_image"] = segmentation.get_output_port()
+        if scenario.clutter.any:
+            clutter = builder.AddNamedSystem(
+                f"{name}.clutter",
+                CameraClutter(
+                    scenario.clutter,
+                    info=camera_info(camera.intrinsics),
+                    seed=(seed + scenario.seeds.cameras, index, 2),
+                ),
+            )
+            for port in ("depth_image", "label_image"):
+                builder.Connect(ports[port], clutter.GetInputPort(port))
+                ports[port] = clutter.GetOutputPort(port)
         for port, output in ports.items():
             builder.ExportOutput(output, f"{name}.{port}")
     if meshcat is not None:

@@ -11,6 +11,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, PassThrough
 
 from iga_drake.paths import diagrams_dir
+from iga_drake.station.cameras.clutter import Clutter
 from iga_drake.station.cameras.rgbd import true_pose
 from iga_drake.station.contract import CHEAT, StationError, check_port_contract
 from iga_drake.station.make import make_station
@@ -286,6 +287,30 @@ def test_fused_ball_lies_on_the_ball():
         counts = fusion.GetOutputPort("camera_counts").Eval(fusion_context)
         assert set(counts) == set(scenario.camera_names)
         assert all(c.valid > 1e5 and c.target > 500 for c in counts.values())
+
+
+def test_clutter_gets_into_the_fused_clouds():
+    """A ring of table about a ball, and none about a box that hovers above it."""
+    hovering = RigidTransform([0.45, -0.15, 0.25])
+    objects = (
+        SceneObject("target", "target", BALL, X_WBALL),
+        SceneObject("grasped", "grasped", BOX, hovering),
+    )
+    scenario = _quiet()
+    scenario.clutter = Clutter(ring=0.06)
+    builder = DiagramBuilder()
+    station = builder.AddSystem(make_station(scenario, scene=_scene(objects=objects), seed=5))
+    fusion = add_fusion(builder, station, scenario)
+    context = builder.Build().CreateDefaultContext()
+    ball, box = (
+        fusion.GetOutputPort(f"{name}_cloud").Eval(fusion.GetMyContextFromRoot(context)).xyzs().T
+        for name in ("target", "grasped")
+    )
+    off = np.linalg.norm(ball - X_WBALL.translation(), axis=1) - RADIUS
+    table = ball[off > 0.01]
+    assert len(table) > 300
+    assert np.abs(table[:, 2]).max() < 0.004 and off.max() < 0.06 + 0.005
+    assert np.abs(hovering.inverse().multiply(box.T)).max() < 0.055
 
 
 def test_one_of_everything_is_built_and_steps():
