@@ -31,7 +31,7 @@ from iga_drake.dataset.oracle import oracle_pose
 from iga_drake.dataset.samples import Sample, make_sample
 from iga_drake.dataset.splits import sample_set
 from iga_drake.errors import IgaDrakeError
-from iga_drake.evaluation.alignment import COLUMNS, FIVE_SETS, FLIP, Errors
+from iga_drake.evaluation.alignment import COLUMNS, EVALUATION_SETS, FLIP, Errors
 from iga_drake.geometry.se3 import geodesic_angle, kabsch, rigid, so3_exp, transform
 from iga_drake.training.correspondence import DescriptorTraining
 
@@ -483,8 +483,8 @@ def add_evaluate_diagnosis(parser: argparse.ArgumentParser) -> None:
     """Options of `iga evaluate diagnosis`."""
     parser.description = "Where the error of a checkpoint comes from."
     parser.add_argument(
-        "--sets", type=lambda text: text.split(","), default=list(FIVE_SETS),
-        help="of samples, separated by commas (default: the paper's five)",
+        "--sets", type=lambda text: text.split(","), default=list(EVALUATION_SETS),
+        help="of samples, separated by commas (default: the paper's five, cross_instance)",
     )  # fmt: skip
     parser.add_argument("--count", type=int, default=50, help="samples of each set (default 50)")
     parser.add_argument("--weights", type=Path, help="of iga (default: the landed ones)")

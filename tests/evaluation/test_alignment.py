@@ -153,6 +153,58 @@ def test_the_oracle_answers_without_an_aligner() -> None:
     assert "easy" in row.rows() and rows[0].grasped in by_category(rows)
 
 
+class _Asked(_Fixed):
+    """The right answer, and the ways up and sizes of clouds that were asked about."""
+
+    def __init__(self) -> None:
+        super().__init__(np.eye(4))
+        self.ups: list = []
+        self.sizes: list = []
+
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
+        shown = [(a.grasped_up, a.target_up) for a in context]
+        self.ups.append((grasped_up, target_up, shown))
+        self.sizes.append((len(grasped), len(target)))
+        return super().align(context, grasped, target, seed=seed)
+
+
+def test_ways_up_are_given_in_sets_of_relations_or_on_demand() -> None:
+    aligner = _Asked()
+    row, _ = evaluate_alignment(aligner, "cross_instance", 4)
+    assert row.up and row.plain.translation_mean == pytest.approx(0, abs=1e-6)
+    for index, (grasped_up, target_up, shown) in enumerate(aligner.ups):
+        sample = make_sample("cross_instance", index, CONFIG)
+        np.testing.assert_allclose(target_up, sample.up[1, -1], atol=1e-6)
+        np.testing.assert_allclose([B for _, B in shown], sample.up[1, :-1], atol=1e-6)
+        if sample.up[0].any():
+            expected = random_pose(index)[:3, :3] @ sample.up[0, -1]
+            np.testing.assert_allclose(grasped_up, expected, atol=1e-6)
+        else:
+            assert grasped_up is None and all(A is None for A, _ in shown)
+    assert any(up is None for up, *_ in aligner.ups) != all(up is None for up, *_ in aligner.ups)
+    for split, up, given in (
+        ("cross_instance", False, False),
+        ("validation", None, False),
+        ("validation", True, True),
+    ):
+        row, _ = evaluate_alignment(aligner, split, 1, up=up)
+        assert row.up == given == (aligner.ups[-1][1] is not None)
+        assert (" up" in row.rows()) == given
+
+
+def test_field_versions_are_kept_apart_from_clean_results(tmp_path: Path) -> None:
+    aligner, store = _Asked(), ResultsStore(tmp_path / "results.jsonl")
+    clean, _ = evaluate_alignment(aligner, "cross_instance", 1, store=store)
+    row, _ = evaluate_alignment(aligner, "cross_instance", 1, field="stray", store=store)
+    assert row.reused == 0 and row.field == "stray" and "cross_instance stray" in row.rows()
+    assert row.ratio(clean) == 1.0 and row.modulo.success == (1.0, 1.0, 1.0)
+    assert all(a > b for a, b in zip(aligner.sizes[1], (485, 100), strict=True))
+    again, _ = evaluate_alignment(aligner, "cross_instance", 1, field="stray", store=store)
+    assert again.reused == 1 and len(aligner.sizes) == 2
+    with pytest.raises(IgaDrakeError, match="field 'fog'"):
+        evaluate_alignment(aligner, "cross_instance", 1, field="fog")
+
+
 def test_bad_arguments_are_refused() -> None:
     with pytest.raises(IgaDrakeError, match=r"one of: train, .*validation"):
         evaluate_alignment(_Fixed(np.eye(4)), "seen", 1)
