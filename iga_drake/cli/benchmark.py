@@ -6,7 +6,7 @@ from iga_drake.cli.subcommands import Subcommand, add_subcommands, run_subcomman
 
 SUBCOMMANDS = {
     name: Subcommand(f"iga_drake.studies.benchmark_{name.replace('-', '_')}")
-    for name in ("control", "data", "fusion", "inference", "ik", "paper-energy")
+    for name in ("control", "data", "fusion", "inference", "ik", "paper-energy", "training")
 }
 
 

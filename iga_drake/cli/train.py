@@ -29,7 +29,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _add_descriptor(parser: argparse.ArgumentParser) -> None:
     add_run_options(parser)
     parser.add_argument("--float32", action="store_true", help="no bfloat16 autocast")
-    parser.add_argument("--compile", action="store_true", help="compile layers (needs g++)")
     parser.add_argument(
         "--initial", type=Path, help="start from these weights instead of at random"
     )

@@ -19,7 +19,12 @@ _logger = logging.getLogger(__name__)
 def collection_keys(source: str, families: str) -> tuple[str, ...]:
     """Keys of the meshes of a collection (`list_collection`) that training, held_out or both kinds
     of sets draw from. Raises `ShapeError` where there are none."""
-    wanted = {"training": ("train",), "held_out": ("held_out",), "both": ("train", "held_out")}
+    wanted = {
+        "training": ("train",),
+        "products": ("train",),
+        "held_out": ("held_out",),
+        "both": ("train", "held_out"),
+    }
     keys = tuple(key for key in _entries(source) if split_of(key) in wanted[families])
     if not keys:
         raise ShapeError(

@@ -27,7 +27,7 @@ class SampleSet:
 
     name: str
     streams: Mapping[str, str]  # of each of STREAMS
-    families: str  # training, held_out or both
+    families: str  # training, held_out, both or products
     count: int | None = None  # None: endless
     composite_share: float = 0.45  # of the objects
     symmetric: bool = True  # False: indices with an exactly symmetric family are left out
@@ -58,14 +58,23 @@ def held_out_families() -> frozenset[str]:
 
 
 @cache
+def later_families() -> frozenset[str]:
+    """Families that the sets before them don't draw."""
+    return frozenset(_document()["later_families"])
+
+
+@cache
 def family_names(families: str) -> tuple[str, ...]:
-    """The training, held_out or both kinds of families, in the registry's order."""
-    held_out = held_out_families()
-    return tuple(
-        name
-        for name in FAMILIES
-        if families == "both" or (name in held_out) == (families == "held_out")
-    )
+    """The training, held_out, products (training and later) or both kinds (training and held_out)
+    of families, in the registry's order."""
+    held_out, later = held_out_families(), later_families()
+    out = {
+        "training": held_out | later,
+        "held_out": set(FAMILIES) - held_out,
+        "products": held_out,
+        "both": later,
+    }[families]
+    return tuple(name for name in FAMILIES if name not in out)
 
 
 @cache
@@ -86,11 +95,12 @@ def sample_set(name: str) -> SampleSet:
 @cache
 def _document() -> dict[str, Any]:
     document = yaml.safe_load(SPLITS_FILE.read_text(encoding="utf-8"))
-    unknown = sorted(set(document["held_out_families"]) - set(FAMILIES))
-    if unknown:
-        raise SplitError(
-            f"{SPLITS_FILE}: held_out_families: {unknown} unknown; one of: {', '.join(FAMILIES)}"
-        )
+    for key in ("held_out_families", "later_families"):
+        unknown = sorted(set(document[key]) - set(FAMILIES))
+        if unknown:
+            raise SplitError(
+                f"{SPLITS_FILE}: {key}: {unknown} unknown; one of: {', '.join(FAMILIES)}"
+            )
     return document
 
 
@@ -105,8 +115,10 @@ def _sample_set(name: str, entry: dict[str, Any]) -> SampleSet:
     result = SampleSet(name=name, **entry)
     if set(result.streams) != set(STREAMS):
         raise SplitError(f"{where}: streams: {sorted(result.streams)}; needed: {sorted(STREAMS)}")
-    if result.families not in ("training", "held_out", "both"):
-        raise SplitError(f"{where}: families: '{result.families}'; training, held_out or both")
+    if result.families not in ("training", "held_out", "both", "products"):
+        raise SplitError(
+            f"{where}: families: '{result.families}'; training, held_out, both or products"
+        )
     if result.pairs < 2 or not 1 <= result.modes < result.pairs:
         raise SplitError(f"{where}: {result.pairs} pairs with {result.modes} modes")
     return result

@@ -30,6 +30,7 @@ from iga_drake.training.run import RunOptions, SavedState, TrainingRun
 from iga_drake.training.settings import TrainingError, replaced
 from iga_drake.training.validation import alignment_errors
 
+TRAINING_SAMPLES = SampleConfig(field=0.6)
 SEED_STRIDE = 10_000_000  # samples between the streams of two seeds
 
 
@@ -46,7 +47,7 @@ class DescriptorSettings:
         """The settings of the run in this folder, else the defaults. Raises `IgaDrakeError`."""
         saved = SavedState.read(folder, KIND)
         if saved is None:
-            return DescriptorSettings(DescriptorConfig(), DescriptorTraining(), SampleConfig())
+            return DescriptorSettings(DescriptorConfig(), DescriptorTraining(), TRAINING_SAMPLES)
         return _saved_settings(saved, folder)
 
 
@@ -137,7 +138,7 @@ def train_descriptor(
             )
         model, config, samples = before.model, config or before.training, samples or before.samples
     model, config = model or DescriptorConfig(), config or DescriptorTraining()
-    samples = samples or SampleConfig()
+    samples = samples or TRAINING_SAMPLES
     torch.manual_seed(config.seed)
     net = DescriptorNet(model).to(device)
     if initial is not None and saved is None:
@@ -153,8 +154,6 @@ def train_descriptor(
         options=options,
         validate=functools.partial(_alignment_errors, model=model, count=config.validation_samples),
     )
-    if options is not None and options.compile:
-        net.compile_layers()
     batches = iter(
         sample_loader(
             config.split,

@@ -68,7 +68,6 @@ def run_options(arguments: argparse.Namespace) -> RunOptions:
         checkpoint_every=arguments.checkpoint_every,
         checkpoint_minutes=arguments.checkpoint_minutes,
         tensorboard=arguments.tensorboard,
-        compile=getattr(arguments, "compile", False),
     )
 
 

@@ -97,9 +97,6 @@ class RunOptions:
     checkpoint_every: int = 200  # steps
     checkpoint_minutes: float = 5.0  # or after this long, what comes first
     tensorboard: bool = False
-    # Layers compiled to machine code at the start: minutes once, then faster steps (CPU, C++
-    # compiler needed); equal up to rounding.
-    compile: bool = False
 
 
 def learning_rate(step: int, config: RunConfig) -> float:

@@ -8,6 +8,7 @@ from iga_drake.dataset.splits import (
     SplitError,
     family_names,
     held_out_families,
+    later_families,
     sample_set,
     sample_sets,
 )
@@ -17,7 +18,10 @@ from iga_drake.shapes.families import FAMILIES
 def test_training_and_held_out_families_share_nothing_and_are_all() -> None:
     training, held_out = set(family_names("training")), set(family_names("held_out"))
     assert not training & held_out and held_out == held_out_families()
-    assert training | held_out == set(FAMILIES) == set(family_names("both"))
+    assert training | held_out == set(family_names("both"))
+    assert not later_families() & (training | held_out)
+    assert training | later_families() == set(family_names("products"))
+    assert later_families() | training | held_out == set(FAMILIES)
 
 
 def test_only_the_sets_that_say_so_share_streams_with_training() -> None:

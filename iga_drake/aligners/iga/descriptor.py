@@ -292,11 +292,6 @@ class DescriptorNet(nn.Module):
             self.local.encoder.double()  # type: ignore[operator, union-attr]
         return self
 
-    def compile_layers(self) -> None:
-        """Compiles the costly layers in place (`torch.compile`); parameters keep their names."""
-        for layer in (self.local, *self.layers):
-            layer.compile()
-
     def similarity(self, a: Tensor, b: Tensor) -> Tensor:
         """Logits (..., M, N) of a match between descriptors (..., M, D) and (..., N, D)."""
         return self.log_temperature.clamp(max=4.6).exp() * (a @ b.transpose(-1, -2))

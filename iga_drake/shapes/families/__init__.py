@@ -4,6 +4,7 @@ from iga_drake.shapes.families.bottles import BOTTLES
 from iga_drake.shapes.families.cleaning import CLEANING
 from iga_drake.shapes.families.containers import CONTAINERS
 from iga_drake.shapes.families.furniture import FURNITURE
+from iga_drake.shapes.families.holders import HOLDERS
 from iga_drake.shapes.families.stands import STANDS
 from iga_drake.shapes.families.tableware import TABLEWARE
 from iga_drake.shapes.families.tools import TOOLS
@@ -24,6 +25,7 @@ _GROUPS: tuple[tuple[Family, ...], ...] = (
     CONTAINERS,
     WEARABLES,
     TOYS,
+    HOLDERS,
 )
 
 FAMILIES: dict[str, Family] = {family.name: family for group in _GROUPS for family in group}
