@@ -21,6 +21,7 @@ SIZE_FACTOR = (0.8, 1.25)  # of an instance's natural size, log-uniform
 # Axes of a frame of A, as columns, in those of a frame of B.
 SAME = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 ON_HOOK = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))  # z up the hook, y along it
+ON_PEG = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))  # y out along the peg, z up
 X_UP = ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))
 
 
@@ -52,12 +53,17 @@ RELATIONS = (
         ON_HOOK, (True, True), ((-0.03, 0.0), (0.0, 0.0), (0.005, 0.02)), pitch=_LITTLE,
     ),
     Relation(
+        "handle on a peg", {"mug": "handle"}, {"peg_tree": "peg_top"},
+        ON_PEG, (True, True), ((-0.025, -0.005), (0.0, 0.0), (0.0, 0.01)), pitch=_LITTLE,
+    ),
+    Relation(
         "hanger on a hook", {"coat_hanger": "hook"}, {"hook_stand": "hook_upper", "rack": "peg"},
         ON_HOOK, (False, True), ((-0.01, 0.01), (0.0, 0.0), (0.005, 0.02)), pitch=_LITTLE,
         upright=(False, True),
     ),
     Relation(
-        "ladle on a hook", {"ladle": "tip"}, {"hook_stand": "hook_upper", "rack": "peg"},
+        "ladle on a hook", {"ladle": "tip"},
+        {"hook_stand": "hook_upper", "rack": "peg", "hook_rail": "hook_first"},
         X_UP, (True, False), ((-0.02, -0.01), (0.0, 0.0), (0.0, 0.02)), pitch=_LITTLE, yaw=_LITTLE,
         axes="handle", upright=(False, True),
     ),
@@ -67,10 +73,11 @@ RELATIONS = (
     ),
     Relation(
         "bottle in a box", {"bottle": "base", "spray_bottle": "base", "jar": "base"},
-        {"box": "floor"}, offset=((-0.02, 0.02), (-0.02, 0.02), (0.0, 0.005)), yaw=_ANY,
+        {"box": "floor", "crate": "floor"},
+        offset=((-0.02, 0.02), (-0.02, 0.02), (0.0, 0.005)), yaw=_ANY,
     ),
     Relation(
-        "shoe in a box", {"shoe": "sole", "boot": "sole"}, {"box": "floor"},
+        "shoe in a box", {"shoe": "sole", "boot": "sole"}, {"box": "floor", "crate": "floor"},
         offset=((-0.01, 0.01), (-0.01, 0.01), (0.0, 0.005)), yaw=_ANY,
     ),
     Relation(
