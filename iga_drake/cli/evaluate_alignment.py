@@ -16,9 +16,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--aligner", type=names, default=["iga", "icp", ORACLE], help="names, or oracle"
     )
     add_aligner_options(parser)
-    parser.add_argument("--sets", type=names, help="of samples (default: the paper's five)")
+    parser.add_argument(
+        "--sets", type=names, help="of samples (default: the paper's five, cross_instance)"
+    )
     parser.add_argument("--count", type=int, default=100, help="samples of each set")
     parser.add_argument("--results", type=Path, help="results file to append to and go on from")
+    parser.add_argument(
+        "--up", action=argparse.BooleanOptionalAction,
+        help="give the aligners the objects' ways up (default: in sets of relations alone)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--field", type=names, default=[], metavar="KINDS",
+        help="also with clouds as in the field: stray, sparse, ring, half, field",
+    )  # fmt: skip
     parser.add_argument("--by-category", action="store_true", help="also by kind of object")
     parser.add_argument("--weights", help="short for --option weights=FILE")
     parser.add_argument("--energy", help="short for --option energy=FILE")
@@ -28,8 +38,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Prints two rows for each aligner and set."""
-    from iga_drake.evaluation.alignment import FIVE_SETS, HEADER, by_category, evaluate_alignment
+    """Prints two rows for each aligner and set, and for each of its field versions."""
+    from iga_drake.evaluation.alignment import (
+        EVALUATION_SETS,
+        HEADER,
+        by_category,
+        evaluate_alignment,
+    )
     from iga_drake.evaluation.results import ResultsStore
 
     short = {name: getattr(arguments, name) for name in ("weights", "energy")}
@@ -43,14 +58,27 @@ def run(arguments: argparse.Namespace) -> None:
         print(HEADER)
     for name in arguments.aligner:
         rows = []
-        for chosen in arguments.sets or FIVE_SETS:
-            summary, found = evaluate_alignment(
-                aligners.get(name), chosen, arguments.count, options=options.get(name), store=store
-            )
-            summaries.append(summary)
-            rows += found
-            if not arguments.json:
+        kinds = arguments.field if name != ORACLE else []  # it knows which points are whose
+        for chosen in arguments.sets or EVALUATION_SETS:
+            clean = None
+            for field in ("", *kinds):
+                summary, found = evaluate_alignment(
+                    aligners.get(name),
+                    chosen,
+                    arguments.count,
+                    up=arguments.up,
+                    field=field,
+                    options=options.get(name),
+                    store=store,
+                )
+                clean = clean or summary
+                summaries.append(summary)
+                rows += [] if field else found
+                if arguments.json:
+                    continue
                 print(summary.rows(), flush=True)
+                if field:
+                    print(f"{'':<41}{summary.ratio(clean):.2f} of the clean share in 2 cm 10°")
         if arguments.by_category and not arguments.json:
             print(by_category(rows))
     if arguments.json:

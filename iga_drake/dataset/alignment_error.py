@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from iga_drake.dataset.samples import Sample, SampleConfig
 from iga_drake.shapes.symmetry import Symmetry
 
-# Observed clouds of the evaluation sets are denser than those of training.
-CONFIG = SampleConfig(cloud_points=512)
+# Observed clouds of the evaluation sets are denser than those of training, and errors are measured
+# modulo the symmetries that the test pair's surfaces have.
+CONFIG = SampleConfig(cloud_points=512, test_surface=True)
 
 
 def random_pose(index: int) -> np.ndarray:
@@ -33,17 +34,30 @@ def pose_errors(estimate: np.ndarray, truth: np.ndarray, cloud: np.ndarray) -> t
 
 
 def equivalents(sample: Sample, *, symmetry: bool) -> np.ndarray:
-    """(n, 4, 4) motions in W of the test pair's A that end in a valid alignment; with `symmetry`
-    also those that differ by the families' symmetries."""
+    """(n, 4, 4) motions in W of the test pair's A that end in a valid alignment.
+
+    With `symmetry` also those that differ by the symmetries of the families and by those found on
+    the surfaces themselves (of samples made with `test_surface`).
+    """
     motions = sample.modes
     if not symmetry:
         return motions
-    of_A, of_B = (
-        _turns(group, axis) for group, axis in zip(sample.symmetries, sample.axes, strict=True)
-    )
+    of_A, of_B = known_symmetries(sample)
     # B's symmetry turns what stands around it; A's turns A in its place.
     motions = motions[:, None] @ of_A[None]
     return (of_B[:, None, None] @ motions[None]).reshape(-1, 4, 4)
+
+
+def known_symmetries(sample: Sample) -> tuple[np.ndarray, np.ndarray]:
+    """Of the test pair's A and B, in W: motions (n, 4, 4) that carry the object onto itself, the
+    family's and those found on its surface; the identity is the first."""
+    of_A, of_B = (
+        np.concatenate((_turns(group, axis), found[1:]))
+        for group, axis, found in zip(
+            sample.symmetries, sample.axes, sample.found_symmetries, strict=True
+        )
+    )
+    return of_A, of_B
 
 
 def _turns(group: Symmetry, axis: np.ndarray) -> np.ndarray:

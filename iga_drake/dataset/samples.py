@@ -8,8 +8,8 @@ canonical instance, in units of that instance's size.
 Frames: O, a shape's own; C, of the canonical pair (B as in its O); W, of one observed pair.
 """
 
-from dataclasses import dataclass
-from functools import cache, lru_cache
+from dataclasses import dataclass, field
+from functools import cache, cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from iga_drake.dataset.collections import collection_keys, collection_mesh
 from iga_drake.dataset.depth_camera import CALIBRATION, Clouds, observe
 from iga_drake.dataset.depth_noise import DepthNoise
 from iga_drake.dataset.field import CLUTTER, FieldCloud, FieldConfig, disturb
+from iga_drake.dataset.relations import RelatedPairs, related_categories, related_pairs
 from iga_drake.dataset.splits import SampleSet, family_names, sample_set
 from iga_drake.geometry.rigid_fit import rigid_fit
 from iga_drake.shapes.composite import CompositeCategory
@@ -25,6 +26,7 @@ from iga_drake.shapes.deformers import DeformableShape, Deformer, LatticeDeforme
 from iga_drake.shapes.families import FAMILIES
 from iga_drake.shapes.surfaces import Surface
 from iga_drake.shapes.symmetry import NO_SYMMETRY, Symmetry
+from iga_drake.shapes.symmetry_search import find_symmetries
 
 COMPOSITE = "composite"
 CAMERAS = 3
@@ -58,6 +60,8 @@ class SampleConfig:
     # and the share of the objects that are.
     meshes: str = ""
     mesh_share: float = 1.0
+    # Keep the test pair's surface, of which symmetries can be found.
+    test_surface: bool = False
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,9 @@ class Sample:
     aligned: np.ndarray  # (2, N, P) bool: in the neighbourhood that keeps its pose
     # (2, N, P) bool: a point of the object; false for clutter, whose `canonical` is 0.
     present: np.ndarray
-    up: np.ndarray  # (2, N, 3) unit vectors in W, the direction that is up when the object stands
+    # (2, N, 3) unit vectors in W, the direction that is up when the object stands; 0 of objects
+    # that may be any way up when they are seen.
+    up: np.ndarray
     size: np.ndarray  # (2, N) m, largest extent of each instance
     mode: np.ndarray  # (N,) int64, which of the modes each pair shows
     # (M, 4, 4) float64: motions of the test pair's A, in W, to every valid alignment; first: none.
@@ -81,11 +87,23 @@ class Sample:
     # about which its family is symmetric.
     axes: np.ndarray
     category: tuple[str, str]
+    # (2, S, 2, 3): of the test pair's A and B, in W: points of the surface (m) and unit normals;
+    # S = 0 unless the options say `test_surface`.
+    surface: np.ndarray = field(default_factory=lambda: np.empty((2, 0, 2, 3), np.float32))
 
     @property
     def symmetries(self) -> tuple[Symmetry, Symmetry]:
         """The symmetries of A's and B's families."""
         return _symmetry(self.category[0]), _symmetry(self.category[1])
+
+    @cached_property
+    def found_symmetries(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of the test pair's A and B, in W: motions (n, 4, 4) that carry the surface onto itself,
+        found in `surface`; the identity is the first, and the only one where there is none."""
+        if not self.surface.shape[1]:
+            return np.eye(4)[None], np.eye(4)[None]
+        A, B = (find_symmetries(*np.moveaxis(each, 1, 0)) for each in self.surface)
+        return A, B
 
 
 @dataclass(frozen=True)
@@ -97,7 +115,7 @@ class _Object:
     normals: np.ndarray  # (N + 1, S, 3)
     spacing: np.ndarray  # (N + 1,) m between neighbouring points
     axis: np.ndarray  # (2, 3) of the test instance: point and direction
-    up: np.ndarray  # (3,) in every instance's own frame
+    up: np.ndarray  # (3,) in every instance's own frame, or 0
 
 
 def make_sample(split: str, index: int, config: SampleConfig | None = None) -> Sample:
@@ -110,7 +128,11 @@ def make_sample(split: str, index: int, config: SampleConfig | None = None) -> S
     else:
         shown = object_index(chosen, k)
         objects = [_remembered(chosen.name, shown, role, config) for role in range(2)]
-    modes = [_Alignment(chosen, k, mode, objects, config) for mode in range(chosen.modes)]
+    modes: list[_Alignment] | list[_Related]
+    if chosen.relations:
+        modes = [_Related(related_pairs(chosen, k, SIZE), objects, config)]
+    else:
+        modes = [_Alignment(chosen, k, mode, objects, config) for mode in range(chosen.modes)]
     attempt = 0
     while True:
         sample = _observe(chosen, k, attempt, objects, modes, config)
@@ -134,6 +156,8 @@ def category_names(
     """Names of A's and B's categories at index k of the set's streams."""
     config = config or SampleConfig()
     k = object_index(chosen, k)
+    if chosen.relations:
+        return related_categories(chosen, k)
     return _category(chosen, k, 0, config)[0], _category(chosen, k, 1, config)[0]
 
 
@@ -186,7 +210,9 @@ def _instances(chosen: SampleSet, k: int, role: int, config: SampleConfig) -> _O
     # A key of its own: the other draws stay as they are.
     lies = chosen.rng("instances", k, role, chosen.pairs + 2)
     up = np.array([0.0, 0.0, 1.0])
-    if category == COMPOSITE or lies.random() >= STANDING:
+    if chosen.relations:
+        up *= related_pairs(chosen, k, SIZE).relation.upright[role]
+    elif category == COMPOSITE or lies.random() >= STANDING:
         up = _direction(lies)
     return _Object(category, *surface, axis, up)
 
@@ -202,6 +228,10 @@ def instance_meshes(
 ) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
     """The category, vertices (N + 1, V, 3) m of its instances, faces (F, 3), and the symmetry axis
     (2, 3) of the test pair's instance."""
+    if chosen.relations:
+        pairs = related_pairs(chosen, k, SIZE)
+        axis = np.stack((np.zeros(3), _symmetry(pairs.category[role]).direction))
+        return pairs.category[role], pairs.vertices[role], pairs.faces[role], axis
     category, structure = _category(chosen, k, role, config)
     base = chosen.rng("instances", k, role)
     each = [chosen.rng("instances", k, role, n) for n in range(chosen.pairs + 1)]
@@ -350,6 +380,19 @@ class _Alignment:
         self.poses[0] = (R @ RA, pA @ R.T + p)
 
 
+class _Related:
+    """The relation of different products, as `_Alignment`; C is B's own frame."""
+
+    def __init__(self, pairs: RelatedPairs, objects: list[_Object], config: SampleConfig):
+        self.near = []
+        for shape, place in zip(objects, pairs.places, strict=True):
+            distance = np.linalg.norm(shape.points[0] - place, axis=1)
+            self.near.append(distance <= np.quantile(distance, config.neighbourhood))
+        X_BA = pairs.X_BA[1:]
+        own = np.tile(np.eye(3), (len(X_BA), 1, 1))
+        self.poses = [(X_BA[:, :3, :3], X_BA[:, :3, 3]), (own, np.zeros((len(X_BA), 3)))]
+
+
 def _rotation(rng: np.random.Generator) -> np.ndarray:
     """A Haar-uniform rotation (3, 3), from a unit quaternion."""
     q = rng.normal(size=4)
@@ -427,7 +470,7 @@ def _observe(
     k: int,
     attempt: int,
     objects: list[_Object],
-    alignments: list[_Alignment],
+    alignments: "list[_Alignment] | list[_Related]",
     config: SampleConfig,
 ) -> Sample | None:
     """The pairs as cameras see them; None where too little of an object is seen.
@@ -439,7 +482,7 @@ def _observe(
     mode = np.arange(N) % len(alignments)  # as many demonstrations of each mode as can be
     mode[:-1] = rng.permutation(mode[:-1])
     mode[-1] = rng.integers(len(alignments))
-    joint = rng.random() < config.joint_share and attempt == 0
+    joint = rng.random() < config.joint_share and attempt == 0 and not chosen.relations
     G, g = np.stack([_rotation(rng) for _ in range(N)]), rng.normal(size=(N, 3)) * 0.2
     points = np.empty((N, 2, config.surface_points, 3))
     normals = np.empty_like(points)
@@ -473,6 +516,9 @@ def _observe(
         place = np.take_along_axis(place, taken[..., None], 2) * present[..., None]
         aligned = np.take_along_axis(aligned, taken, 2) & present
     test_A, test_B = poses[:, -1]
+    surface = np.stack((points[-1], normals[-1]), 2).astype(np.float32)
+    if not config.test_surface:
+        surface = surface[:, :0]
     return Sample(
         points=observed,
         canonical=place,
@@ -484,6 +530,7 @@ def _observe(
         modes=_modes(alignments, int(mode[-1]), test_A, test_B),
         axes=np.stack([_move_axis(poses[role, -1], objects[role].axis) for role in range(2)]),
         category=(objects[0].category, objects[1].category),
+        surface=surface,
     )
 
 
@@ -555,7 +602,7 @@ def _pose(R: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def _modes(
-    alignments: list[_Alignment], shown: int, X_WA: np.ndarray, X_WB: np.ndarray
+    alignments: "list[_Alignment] | list[_Related]", shown: int, X_WA: np.ndarray, X_WB: np.ndarray
 ) -> np.ndarray:
     """(M, 4, 4) motions in W of the test pair's A from the shown mode to each, B held still."""
     motions = []

@@ -40,6 +40,9 @@ class SampleSet:
     views: int = 1  # samples that show the same two objects, aligned and seen anew each time
     from_above: float = 0.0  # share of the clouds whose cameras stand above the object's up
     noise: bool = True  # of the depth cameras
+    # Different products in the relations of `relations.py`, upright on a table, in place of objects
+    # that touch anywhere; composite_share, modes, variation and independent_share don't count then.
+    relations: bool = False
     # Cameras and DIF-Net in double precision: slower, and the same points on every machine.
     double: bool = False
 

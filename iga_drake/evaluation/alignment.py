@@ -5,13 +5,16 @@ centroid of the grasped cloud ends from where it belongs; rotation error: geodes
 demonstrations show several alignments, the nearest one counts. Two kinds of error are reported:
 
 - plain: against the alignments as generated;
-- modulo symmetry: where A's or B's family is (nearly) symmetric, against the nearest of the
-  alignments that are the same up to the symmetry.
+- modulo symmetry: where A or B is (nearly) symmetric, by its family or by chance, against the
+  nearest of the alignments that are the same up to the symmetry.
+
+An answer whose rotation is off by more than `FLIP` is a flip. The objects' ways up are given to the
+aligner in sets of relations, in others only on demand.
 """
 
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +26,10 @@ from iga_drake.aligners.query import Query
 from iga_drake.aligners.registry import ORACLE
 from iga_drake.checkpoint import file_digest, load_checkpoint
 from iga_drake.dataset.alignment_error import CONFIG, equivalents, nearest_error, random_pose
+from iga_drake.dataset.field_versions import FIELD_KINDS, field_clouds
 from iga_drake.dataset.oracle import oracle_pose
-from iga_drake.dataset.samples import make_sample
-from iga_drake.dataset.splits import sample_sets
+from iga_drake.dataset.samples import Sample, make_sample
+from iga_drake.dataset.splits import sample_set, sample_sets
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, config_digest
 
@@ -36,7 +40,15 @@ FIVE_SETS = (
     "unseen_categories",
     "multi_modal",
 )
+EVALUATION_SETS = (*FIVE_SETS, "cross_instance")
 THRESHOLDS = ((0.01, 5.0), (0.02, 10.0), (0.03, 15.0))  # m, deg
+FLIP = 45.0  # deg
+CLOSE = 1  # of THRESHOLDS, by which a field version is compared with the clean set
+# Head of `Errors.columns`.
+COLUMNS = (
+    f"{'cm mean ± std (median)':<21}  {'deg mean ± std (median)':<20}  "
+    "% in 1 cm 5°, 2 cm 10°, 3 cm 15°, flips"
+)
 
 
 @dataclass(frozen=True)
@@ -53,6 +65,8 @@ class SampleErrors:
     translation_modulo: float  # modulo symmetry
     rotation_modulo: float
     seconds: float
+    up: bool = False  # whether the objects' ways up were given
+    field: str = ""  # one of FIELD_KINDS; none: clean
     reused: bool = False  # measured before, and found in a results file
 
 
@@ -67,6 +81,7 @@ class Errors:
     rotation_std: float
     rotation_median: float
     success: tuple[float, ...]  # share within each of THRESHOLDS
+    flips: float  # share off by more than FLIP
 
     @staticmethod
     def of(translation: np.ndarray, rotation: np.ndarray) -> "Errors":
@@ -80,6 +95,7 @@ class Errors:
             float(deg.std()),
             float(np.median(deg)),
             tuple(float(((cm <= 100 * m) & (deg <= d)).mean()) for m, d in THRESHOLDS),
+            float((deg > FLIP).mean()),
         )
 
     def columns(self) -> str:
@@ -89,7 +105,7 @@ class Errors:
             f"{self.translation_mean:5.2f} ± {self.translation_std:5.2f} "
             f"({self.translation_median:5.2f})  "
             f"{self.rotation_mean:5.1f} ± {self.rotation_std:4.1f} ({self.rotation_median:5.1f})  "
-            f"{rates}"
+            f"{rates}  {100 * self.flips:5.1f}"
         )
 
 
@@ -104,27 +120,52 @@ class AlignmentErrors:
     modulo: Errors  # modulo symmetry
     seconds_median: float
     reused: int  # how many of the errors were found in a results file
+    up: bool = False
+    field: str = ""
+
+    def ratio(self, clean: "AlignmentErrors") -> float:
+        """Share within 2 cm and 10 degrees, modulo symmetry, as a share of that of clean clouds."""
+        return self.modulo.success[CLOSE] / max(clean.modulo.success[CLOSE], 1e-9)
 
     def rows(self) -> str:
         """Two lines of the table under `HEADER`: plain, and modulo symmetry."""
-        first = f"{self.aligner:<8} {self.split:<18} {self.count:>5}"
+        name = " ".join(filter(None, (self.split, self.field, "up" if self.up else "")))
+        first = f"{self.aligner:<8} {name:<24} {self.count:>5}"
         reused = f"  {self.reused} reused" if self.reused else ""
         return (
             f"{first}  plain   {self.plain.columns()}  {self.seconds_median:6.2f}{reused}\n"
-            f"{'':<33}  modulo  {self.modulo.columns()}"
+            f"{'':<39}  modulo  {self.modulo.columns()}"
         )
 
 
-HEADER = (
-    f"{'aligner':<8} {'set':<18} {'count':>5}  {'error':<6}  {'cm mean ± std (median)':<21}  "
-    f"{'deg mean ± std (median)':<20}  % in 1 cm 5°, 2 cm 10°, 3 cm 15°   s"
-)
+HEADER = f"{'aligner':<8} {'set':<24} {'count':>5}  {'error':<6}  {COLUMNS}   s"
 
 
-def evaluate_sample(aligner: Aligner | None, split: str, index: int) -> SampleErrors | None:
-    """The errors of an aligner on sample `index` of a set.
+def sample_query(
+    sample: Sample, split: str, index: int, *, up: bool = False, field: str = ""
+) -> Query:
+    """What an aligner is asked about sample `index` of a set: with the objects' ways up, where they
+    have one, if `up`; with its clouds as in one of FIELD_KINDS, if `field`."""
+    A, B = (each if up and each.any(1).all() else None for each in sample.up.astype(np.float64))
+    start = random_pose(index)
+    query = Query.of(sample.points, start, grasped_up=A, target_up=B)
+    if not field:
+        return query
+    clouds_A, clouds_B = field_clouds(sample, field, split, index)
+    context = tuple(
+        replace(shown, grasped=clouds_A[n], target=clouds_B[n])
+        for n, shown in enumerate(query.context)
+    )
+    grasped = clouds_A[-1] @ start[:3, :3].T + start[:3, 3]
+    return replace(query, context=context, grasped=grasped, target=clouds_B[-1])
 
-    Without an aligner the oracle answers; None if it has no answer.
+
+def evaluate_sample(
+    aligner: Aligner | None, split: str, index: int, *, up: bool = False, field: str = ""
+) -> SampleErrors | None:
+    """The errors of an aligner on sample `index` of a set (see `sample_query`).
+
+    Without an aligner the oracle answers, of the clean clouds; None if it has no answer.
     """
     sample = make_sample(split, index, CONFIG)
     test = sample.points[0, -1]
@@ -134,7 +175,7 @@ def evaluate_sample(aligner: Aligner | None, split: str, index: int) -> SampleEr
         if motion is None:
             return None
     else:
-        query = Query.of(sample.points, random_pose(index))
+        query = sample_query(sample, split, index, up=up, field=field)
         began = time.perf_counter()
         motion = query.motion(query.ask(aligner, index))
     seconds = time.perf_counter() - began
@@ -151,6 +192,8 @@ def evaluate_sample(aligner: Aligner | None, split: str, index: int) -> SampleEr
         translation_modulo=modulo[0],
         rotation_modulo=modulo[1],
         seconds=seconds,
+        up=up,
+        field=field,
     )
 
 
@@ -159,24 +202,32 @@ def evaluate_alignment(
     split: str,
     count: int,
     *,
+    up: bool | None = None,
+    field: str = "",
     options: Mapping[str, Any] | None = None,
     store: ResultsStore | None = None,
 ) -> tuple[AlignmentErrors, list[SampleErrors]]:
     """Aligns the first `count` samples of a set; every aligner gets the same samples and starts.
 
     Without an aligner the oracle answers; samples on which it has no answer are left out of the
-    means and of the count. `options` are those that the aligner was made with; errors that the
+    means and of the count. `up` and `field` as in `sample_query`; None gives the ways up in sets
+    of relations alone. `options` are those that the aligner was made with; errors that the
     store holds are taken from there, others put there. Raises `IgaDrakeError`.
     """
     if split not in sample_sets():
         raise IgaDrakeError(f"set '{split}' is not known; one of: {', '.join(sample_sets())}")
     if count < 1:
         raise IgaDrakeError(f"count {count}: at least 1 sample is needed")
+    if field and field not in FIELD_KINDS:
+        raise IgaDrakeError(f"field '{field}' is not known; one of: {', '.join(FIELD_KINDS)}")
     name = aligner.name if aligner else ORACLE
+    given = aligner is not None and (sample_set(split).relations if up is None else up)
     common = {
         "kind": "alignment",
         "set": split,
         "config": config_digest(CONFIG),
+        "up": given,
+        "field": field,
         **aligner_key(aligner, name, options),
         "code": code_key(aligner),
     }
@@ -187,7 +238,7 @@ def evaluate_alignment(
         if known is not None:
             rows.append(SampleErrors(**known, reused=True))
             continue
-        row = evaluate_sample(aligner, split, index)
+        row = evaluate_sample(aligner, split, index, up=given, field=field)
         if row is None:
             continue
         if store:
@@ -212,6 +263,8 @@ def summarise_errors(rows: Iterable[SampleErrors]) -> AlignmentErrors:
         modulo=Errors.of(table[:, 2], table[:, 3]),
         seconds_median=float(np.median([r.seconds for r in rows])),
         reused=sum(r.reused for r in rows),
+        up=rows[0].up,
+        field=rows[0].field,
     )
 
 
@@ -221,12 +274,12 @@ def by_category(rows: Iterable[SampleErrors]) -> str:
     for row in rows:
         for category in {row.grasped, row.target}:
             table.setdefault(category, []).append((row.translation_modulo, row.rotation_modulo))
-    lines = [f"{'category':<16} {'count':>5}  cm mean (median)  deg mean (median)"]
+    lines = [f"{'category':<16} {'count':>5}  cm mean (median)  deg mean (median)  flips %"]
     for category, values in sorted(table.items(), key=lambda item: -np.mean(item[1], 0)[1]):
         cm, deg = np.array(values).T * [[100.0], [180 / np.pi]]
         lines.append(
             f"{category:<16} {len(values):>5}  {cm.mean():5.2f} ({np.median(cm):5.2f})     "
-            f"{deg.mean():5.1f} ({np.median(deg):5.1f})"
+            f"{deg.mean():5.1f} ({np.median(deg):5.1f})     {100 * np.mean(deg > FLIP):5.1f}"
         )
     return "\n".join(lines)
 

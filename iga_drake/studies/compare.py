@@ -36,7 +36,7 @@ from iga_drake.dataset.loader import collate
 from iga_drake.dataset.samples import Sample, SampleConfig, make_sample
 from iga_drake.dataset.splits import sample_sets
 from iga_drake.errors import IgaDrakeError
-from iga_drake.evaluation.alignment import Errors
+from iga_drake.evaluation.alignment import COLUMNS, Errors
 from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, config_digest
 from iga_drake.files import write_text
 from iga_drake.training.correspondence import LOSS_FIELDS, DescriptorTraining, descriptor_loss
@@ -99,8 +99,7 @@ class Compared:
 
 HEADER = (
     f"{'aligner':<10} {'set':<18} {'count':>5} {'samples':>9} {'FLOP':>9} {'minutes':>8} {'s':>8}  "
-    f"{'cm mean ± std (median)':<21}  {'deg mean ± std (median)':<20}  "
-    "% in 1 cm 5°, 2 cm 10°, 3 cm 15°"
+    f"{COLUMNS}"
 )
 
 

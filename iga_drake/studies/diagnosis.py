@@ -13,24 +13,40 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from iga_drake.aligners.iga.aligner import Explanation, IgaAligner
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.aligners.query import Query
-from iga_drake.dataset.alignment_error import CONFIG, equivalents, nearest_error, random_pose
+from iga_drake.dataset.alignment_error import (
+    CONFIG,
+    equivalents,
+    known_symmetries,
+    nearest_error,
+    nearest_valid,
+    pose_errors,
+    random_pose,
+)
 from iga_drake.dataset.oracle import oracle_pose
 from iga_drake.dataset.samples import Sample, make_sample
 from iga_drake.dataset.splits import sample_set
 from iga_drake.errors import IgaDrakeError
-from iga_drake.evaluation.alignment import FIVE_SETS, Errors
+from iga_drake.evaluation.alignment import COLUMNS, EVALUATION_SETS, FLIP, Errors
 from iga_drake.geometry.se3 import geodesic_angle, kabsch, rigid, so3_exp, transform
 from iga_drake.training.correspondence import DescriptorTraining
 
-WRONG = np.radians(45)  # a coarse hypothesis further off than this is wrong
+WRONG = np.radians(FLIP)  # a coarse hypothesis further off than this is wrong
 TERCILES = ("least", "middle", "most")
 LOWER = 1e-3  # an energy counts as lower than another where it is by this much
+# About which axis of which object an answer is turned by half, the longest axis first.
+TURNED = (
+    *(
+        f"{role}, {axis} axis"
+        for role in ("grasped", "target")
+        for axis in ("long", "middle", "short")
+    ),
+    "otherwise",
+)
 # Poses that are compared: key -> name in the table, which says how the pose was found.
 POSES = {
     "plain": "found, plain",
@@ -68,7 +84,7 @@ class Problem:
         return Problem(self.sample, query)
 
     def valid(self) -> np.ndarray:
-        """(n, 4, 4) right answers X_WF, those that differ by the families' symmetries too."""
+        """(n, 4, 4) right answers X_WF, those that differ by the objects' symmetries too."""
         return equivalents(self.sample, symmetry=True) @ np.linalg.inv(self.query.start)
 
     def error(self, X_WF: np.ndarray, *, symmetry: bool = True) -> tuple[float, float]:
@@ -84,7 +100,7 @@ class ObjectMatches:
     category: str
     # Angle (rad) of every coarse hypothesis from the true rotation, best hypothesis first.
     off: tuple[float, ...]
-    off_modulo: tuple[float, ...]  # the same modulo the family's symmetry
+    off_modulo: tuple[float, ...]  # the same modulo symmetry
     # Match errors over nodes, by the names of MATCHES: mean (m), mean and median as shares of the
     # object's size.
     error: dict[str, tuple[float, float, float]]
@@ -105,6 +121,9 @@ class Diagnosis:
     energy_from_truth: float
     deformation: float
     objects: tuple[ObjectMatches, ...]
+    categories: tuple[str, str]  # of A and B
+    # How the found pose is turned as a whole (`turned_about`), "" where it isn't.
+    flip: str
 
 
 def true_logits(sample: Sample, index: Tensor, sigma: float) -> Tensor:
@@ -144,7 +163,7 @@ def hypothesis_errors(
     problem: Problem, explanation: Explanation, role: int, d: int
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Angles (rad) of the coarse hypotheses of an object from the true rotation between the test
-    and demonstration d; plain and modulo the family's symmetry."""
+    and demonstration d; plain and modulo symmetry."""
     sample = problem.sample
     size = sample.size[role, :, None, None]
     fit = kabsch(
@@ -155,8 +174,7 @@ def hypothesis_errors(
     found = explanation.matches[role][d].R_DT
     if role == 0:
         found = found @ torch.from_numpy(problem.query.start[:3, :3])
-    turns = sample.symmetries[role].angles()[:, None] * sample.axes[role, 1]
-    same = truth @ torch.from_numpy(Rotation.from_rotvec(turns).as_matrix())
+    same = truth @ torch.from_numpy(known_symmetries(sample)[role][:, :3, :3])
     off = geodesic_angle(found[:, None], same)
     return tuple(off[:, 0].tolist()), tuple(off.amin(1).tolist())
 
@@ -188,6 +206,33 @@ def match_errors(
         mean, median = float(error[seen].mean()), float(error[seen].median())
         result[name] = (size * mean, mean, median)
     return result
+
+
+def turned_about(sample: Sample, motion: np.ndarray) -> str:
+    """By which half-turn a motion (4, 4) of the test pair's A in W is off from the nearest right
+    one, modulo symmetry: one of TURNED; "" where the rotation is off by at most FLIP.
+
+    The half-turns are those about the principal axes of A and B, by the test pair's surfaces. The
+    nearest one counts if what is left is at most FLIP.
+    """
+    cloud = sample.points[0, -1]
+    right = nearest_valid(motion, equivalents(sample, symmetry=True), cloud)
+    if pose_errors(motion, right, cloud)[1] <= WRONG:
+        return ""
+    answers = []
+    for role in range(2):
+        points = sample.surface[role, :, 0].astype(np.float64)
+        axes = np.linalg.eigh(np.cov(points.T))[1].T[::-1]  # the longest first
+        turns = np.tile(np.eye(4), (3, 1, 1))
+        turns[:, :3, :3] = 2 * axes[:, :, None] * axes[:, None] - np.eye(3)
+        centre = points.mean(0)
+        turns[:, :3, 3] = centre - turns[:, :3, :3] @ centre
+        answers.append(right @ turns if role == 0 else turns @ right)
+    turned = np.concatenate(answers)
+    nearest = nearest_valid(motion, turned, cloud)
+    if pose_errors(motion, nearest, cloud)[1] > WRONG:
+        return TURNED[-1]
+    return TURNED[int((turned == nearest).all((1, 2)).argmax())]
 
 
 def step_from(X: Tensor, centre: Tensor, step: Tensor) -> Tensor:
@@ -270,6 +315,8 @@ def diagnose_sample(aligner: IgaAligner, split: str, index: int) -> Diagnosis:
             for role in range(2)
             for d in range(len(problem.query.context))
         ),
+        categories=sample.category,
+        flip=turned_about(sample, found @ problem.query.start),
     )
 
 
@@ -326,6 +373,9 @@ class Summary:
     matches: dict[str, tuple[float, float, float]]  # by the names of MATCHES: cm, %, median %
     hypotheses: Hypotheses
     categories: dict[str, Hypotheses]
+    # Of answers turned as a whole: by category (samples with it, flips), and by TURNED.
+    flips_by_category: dict[str, tuple[int, int]]
+    flips_by_axis: dict[str, int]
     # For each of TERCILES: least and greatest deformation, errors of the found pose.
     deformation: tuple[tuple[float, float, Errors], ...]
 
@@ -333,8 +383,7 @@ class Summary:
         """The summary as text; with `categories` also coarse hypotheses by category."""
         lines = [
             f"{self.split}, {self.count} samples; errors modulo symmetry unless said otherwise",
-            f"{'':<22} {'count':>5}  {'cm mean ± std (median)':<21}  "
-            f"{'deg mean ± std (median)':<22}  % in 1 cm 5°, 2 cm 10°, 3 cm 15°",
+            f"{'':<22} {'count':>5}  {COLUMNS}",
         ]
         for name, (count, errors) in self.errors.items():
             lines.append(f"{POSES[name]:<22} {count:>5}  {errors.columns()}")
@@ -342,6 +391,14 @@ class Summary:
         for name, (low, high, errors) in zip(TERCILES, self.deformation, strict=False):
             label = f"{name}, {100 * low:.1f}-{100 * high:.1f}"
             lines.append(f"{label:<22} {'':>5}  {errors.columns()}")
+        flipped = sum(self.flips_by_axis.values())
+        lines.append(f"turned by over {FLIP:.0f}°: {flipped} of {self.count} answers")
+        for names in (
+            {name: f"{k} of {n}" for name, (n, k) in self.flips_by_category.items() if k},
+            self.flips_by_axis,
+        ):
+            if names:
+                lines.append("  " + "; ".join(f"{name}: {k}" for name, k in names.items()))
         lines += [
             f"energy of the found pose below the truth's: {100 * self.below_truth:.0f} % of the "
             f"samples, median difference {self.gap_median:.2f}",
@@ -400,8 +457,21 @@ def summarise_diagnoses(rows: Iterable[Diagnosis]) -> Summary:
             name: Hypotheses.of([o for o in objects if o.category == name])
             for name in sorted({o.category for o in objects})
         },
+        flips_by_category=_flips_by_category(rows),
+        flips_by_axis={
+            name: count for name in TURNED if (count := sum(row.flip == name for row in rows))
+        },
         deformation=tuple(terciles),
     )
+
+
+def _flips_by_category(rows: Sequence[Diagnosis]) -> dict[str, tuple[int, int]]:
+    """Category -> number of samples with it, and of flips among them; most flips first."""
+    table = {}
+    for name in sorted({name for row in rows for name in row.categories}):
+        flips = [bool(row.flip) for row in rows if name in row.categories]
+        table[name] = len(flips), sum(flips)
+    return dict(sorted(table.items(), key=lambda item: -item[1][1]))
 
 
 def _errors(values: Sequence[tuple[float, float]]) -> Errors:
@@ -413,8 +483,8 @@ def add_evaluate_diagnosis(parser: argparse.ArgumentParser) -> None:
     """Options of `iga evaluate diagnosis`."""
     parser.description = "Where the error of a checkpoint comes from."
     parser.add_argument(
-        "--sets", type=lambda text: text.split(","), default=list(FIVE_SETS),
-        help="of samples, separated by commas (default: the paper's five)",
+        "--sets", type=lambda text: text.split(","), default=list(EVALUATION_SETS),
+        help="of samples, separated by commas (default: the paper's five, cross_instance)",
     )  # fmt: skip
     parser.add_argument("--count", type=int, default=50, help="samples of each set (default 50)")
     parser.add_argument("--weights", type=Path, help="of iga (default: the landed ones)")

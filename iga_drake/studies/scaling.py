@@ -18,7 +18,7 @@ import torch
 from iga_drake.aligners.iga.aligner import Explanation, IgaAligner
 from iga_drake.dataset.splits import sample_set
 from iga_drake.errors import IgaDrakeError
-from iga_drake.evaluation.alignment import Errors
+from iga_drake.evaluation.alignment import COLUMNS, Errors
 from iga_drake.studies.diagnosis import Problem
 from iga_drake.viewing.figures import check_figure, new_figure, write_figure
 
@@ -53,14 +53,14 @@ class Cost:
             f"{self.proposals:>9,} {self.comparisons:>11,} {stages} {self.total:7.3f} "
             f"{self.memory / 2**20:7.0f}   {self.errors.translation_mean:5.2f} "
             f"({self.errors.translation_median:5.2f})  {self.errors.rotation_mean:5.1f} "
-            f"({self.errors.rotation_median:5.1f})"
+            f"({self.errors.rotation_median:5.1f})  {100 * self.errors.flips:5.1f}"
         )
 
 
 HEADER = (
     f"{'demos':>5} {'nodes':>6} {'within':>9} {'across':>9} {'proposals':>9} {'comparisons':>11} "
     + " ".join(f"{stage:>8}" for stage in STAGES)
-    + f" {'s':>7} {'MiB':>7}   cm mean (med.)  deg mean (med.)"
+    + f" {'s':>7} {'MiB':>7}   cm mean (med.)  deg mean (med.)  flips %"
 )
 
 
@@ -255,10 +255,7 @@ class DiversityErrors:
         return f"{self.split:<17} {self.demonstrations:>5} {self.count:>6}  {self.errors.columns()}"
 
 
-DIVERSITY_HEADER = (
-    f"{'set':<17} {'demos':>5} {'count':>6}  {'cm mean ± std (median)':<21}  "
-    f"{'deg mean ± std (median)':<22}  % in 1 cm 5°, 2 cm 10°, 3 cm 15°"
-)
+DIVERSITY_HEADER = f"{'set':<17} {'demos':>5} {'count':>6}  {COLUMNS}"
 
 
 def diversity_errors(

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from iga_drake.aligners.iga.aligner import default_weights
@@ -19,7 +20,7 @@ from iga_drake.dataset.alignment_error import (
 )
 from iga_drake.dataset.samples import make_sample
 from iga_drake.errors import IgaDrakeError
-from iga_drake.evaluation.alignment import by_category, evaluate_alignment, model_card
+from iga_drake.evaluation.alignment import Errors, by_category, evaluate_alignment, model_card
 from iga_drake.evaluation.results import ResultsStore
 from iga_drake.shapes.families import FAMILIES
 
@@ -72,11 +73,38 @@ def test_the_truth_has_no_error_and_an_offset_shows() -> None:
     assert [r.translation for r in rows] == pytest.approx([0.015] * 3)
 
 
+def test_answers_off_by_over_45_degrees_are_flips() -> None:
+    errors = Errors.of(np.zeros(4), np.radians([0.0, 44.0, 46.0, 180.0]))
+    assert errors.flips == 0.5 and errors.columns().endswith("50.0")
+    turn = _about(np.zeros(3), np.array([0.0, 0.0, 2.0]))
+    row, rows = evaluate_alignment(_Fixed(turn), "validation", 2)
+    assert row.plain.flips == 1.0 and "flips" in by_category(rows)
+
+
 def test_any_of_the_modes_is_right() -> None:
     sample = make_sample("multi_modal", 0, CONFIG)
     for motion in sample.modes:
         error = nearest_error(motion, equivalents(sample, symmetry=False), sample.points[0, -1])
         assert error == pytest.approx((0, 0), abs=1e-6)
+
+
+def test_errors_modulo_symmetry_forgive_what_turns_a_surface_into_itself() -> None:
+    """Of a composite whose surface is a cuboid: half-turns about its axes, no quarter-turns."""
+    sample = make_sample("unseen_instances", 0, replace(CONFIG, test_surface=False))
+    assert [len(found) for found in sample.found_symmetries] == [1, 1]
+    box = trimesh.creation.box((0.08, 0.12, 0.2))
+    points, faces = trimesh.sample.sample_surface(box, 2000, seed=0)
+    centre = np.array([0.3, -0.2, 0.1])
+    surface = np.stack((points + centre, box.face_normals[faces]), 1).astype(np.float32)
+    there = replace(
+        sample, category=("composite", "composite"), surface=np.stack((surface, surface))
+    )
+    valid, cloud = equivalents(there, symmetry=True), there.points[0, -1]
+    assert len(valid) == 16
+    for axis in np.eye(3):
+        error = nearest_error(_about(centre, np.pi * axis), valid, cloud)
+        assert error[0] < 0.002 and np.degrees(error[1]) < 1.5
+        assert nearest_error(_about(centre, np.pi / 2 * axis), valid, cloud)[1] > 1
 
 
 def test_errors_modulo_symmetry_forgive_the_family_s_own_turns_and_no_others() -> None:
@@ -123,6 +151,58 @@ def test_the_oracle_answers_without_an_aligner() -> None:
     row, rows = evaluate_alignment(None, "easy", 3)
     assert row.aligner == "oracle" and 0 < row.plain.translation_median < 1.0
     assert "easy" in row.rows() and rows[0].grasped in by_category(rows)
+
+
+class _Asked(_Fixed):
+    """The right answer, and the ways up and sizes of clouds that were asked about."""
+
+    def __init__(self) -> None:
+        super().__init__(np.eye(4))
+        self.ups: list = []
+        self.sizes: list = []
+
+    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
+        shown = [(a.grasped_up, a.target_up) for a in context]
+        self.ups.append((grasped_up, target_up, shown))
+        self.sizes.append((len(grasped), len(target)))
+        return super().align(context, grasped, target, seed=seed)
+
+
+def test_ways_up_are_given_in_sets_of_relations_or_on_demand() -> None:
+    aligner = _Asked()
+    row, _ = evaluate_alignment(aligner, "cross_instance", 4)
+    assert row.up and row.plain.translation_mean == pytest.approx(0, abs=1e-6)
+    for index, (grasped_up, target_up, shown) in enumerate(aligner.ups):
+        sample = make_sample("cross_instance", index, CONFIG)
+        np.testing.assert_allclose(target_up, sample.up[1, -1], atol=1e-6)
+        np.testing.assert_allclose([B for _, B in shown], sample.up[1, :-1], atol=1e-6)
+        if sample.up[0].any():
+            expected = random_pose(index)[:3, :3] @ sample.up[0, -1]
+            np.testing.assert_allclose(grasped_up, expected, atol=1e-6)
+        else:
+            assert grasped_up is None and all(A is None for A, _ in shown)
+    assert any(up is None for up, *_ in aligner.ups) != all(up is None for up, *_ in aligner.ups)
+    for split, up, given in (
+        ("cross_instance", False, False),
+        ("validation", None, False),
+        ("validation", True, True),
+    ):
+        row, _ = evaluate_alignment(aligner, split, 1, up=up)
+        assert row.up == given == (aligner.ups[-1][1] is not None)
+        assert (" up" in row.rows()) == given
+
+
+def test_field_versions_are_kept_apart_from_clean_results(tmp_path: Path) -> None:
+    aligner, store = _Asked(), ResultsStore(tmp_path / "results.jsonl")
+    clean, _ = evaluate_alignment(aligner, "cross_instance", 1, store=store)
+    row, _ = evaluate_alignment(aligner, "cross_instance", 1, field="stray", store=store)
+    assert row.reused == 0 and row.field == "stray" and "cross_instance stray" in row.rows()
+    assert row.ratio(clean) == 1.0 and row.modulo.success == (1.0, 1.0, 1.0)
+    assert all(a > b for a, b in zip(aligner.sizes[1], (485, 100), strict=True))
+    again, _ = evaluate_alignment(aligner, "cross_instance", 1, field="stray", store=store)
+    assert again.reused == 1 and len(aligner.sizes) == 2
+    with pytest.raises(IgaDrakeError, match="field 'fog'"):
+        evaluate_alignment(aligner, "cross_instance", 1, field="fog")
 
 
 def test_bad_arguments_are_refused() -> None:

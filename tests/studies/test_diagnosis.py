@@ -10,12 +10,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from iga_drake.aligners.iga.aligner import Explanation, IgaAligner
-from iga_drake.dataset.alignment_error import random_pose
-from iga_drake.dataset.samples import Sample
+from iga_drake.dataset.alignment_error import CONFIG, random_pose
+from iga_drake.dataset.samples import Sample, make_sample
 from iga_drake.errors import IgaDrakeError
 from iga_drake.geometry.se3 import so3_exp, so3_log
 from iga_drake.studies.diagnosis import (
     POSES,
+    TURNED,
     Diagnosis,
     Hypotheses,
     ObjectMatches,
@@ -28,6 +29,7 @@ from iga_drake.studies.diagnosis import (
     match_errors,
     summarise_diagnoses,
     true_logits,
+    turned_about,
 )
 
 SIGMA = 0.05
@@ -123,7 +125,9 @@ def _matches(category: str, *degrees: float) -> ObjectMatches:
 
 def _row(index: int, error: float, energies: tuple[float, ...], deformed: float) -> Diagnosis:
     errors = dict.fromkeys(POSES, (error / 100, np.radians(error)))
-    return Diagnosis("easy", index, errors, *energies, deformed, (_matches("mug", 10, 90),))
+    objects = (_matches("mug", 10, 90),)
+    flip = TURNED[0] if error > 8 else ""
+    return Diagnosis("easy", index, errors, *energies, deformed, objects, ("mug", "pan"), flip)
 
 
 def test_shares_of_wrong_hypotheses() -> None:
@@ -142,6 +146,31 @@ def test_the_summary_counts_energies_and_sorts_by_deformation() -> None:
     assert [e.translation_mean for _, _, e in summary.deformation] == pytest.approx([1, 5, 9])
     table = summary.table(categories=True)
     assert "67 % of the samples" in table and "mug" in table
+    assert summary.flips_by_category == {"mug": (3, 1), "pan": (3, 1)}
+    assert summary.flips_by_axis == {TURNED[0]: 1} and "mug: 1 of 3" in table
+    assert "grasped, long axis: 1" in table
+
+
+@pytest.mark.parametrize("name", TURNED)
+def test_a_flip_is_told_by_its_axis(name: str) -> None:
+    """Of boxes of 8, 12 and 20 cm along x, y and z (marked, so that they aren't symmetric)."""
+    sample = replace(make_sample("unseen_instances", 0, CONFIG), category=("composite",) * 2)
+    rng = np.random.default_rng(0)
+    boxes = rng.uniform(-0.5, 0.5, (2, 2000, 3)) * (0.08, 0.12, 0.2)
+    boxes[:, ::4] = np.abs(boxes[:, ::4])
+    boxes[0] += (0.2, 0.1, 0.0)
+    surface = np.stack((boxes, np.tile((0.0, 0.0, 1.0), (2, 2000, 1))), 2).astype(np.float32)
+    sample = replace(sample, points=np.tile(boxes[:, None, :512], (1, 5, 1, 1)), surface=surface)
+    assert turned_about(sample, np.eye(4)) == ""
+    role, _, axis = name.partition(", ")
+    vector = np.array({"long axis": (0, 0, 1), "middle axis": (0, 1, 0)}.get(axis, (1, 0, 0)))
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec(np.radians(170) * vector).as_matrix()
+    centre = boxes[1 if role == "target" else 0].mean(0)
+    if role == "otherwise":
+        turn[:3, :3] = Rotation.from_rotvec([0.0, 0.0, np.pi / 2]).as_matrix()
+    turn[:3, 3] = centre - turn[:3, :3] @ centre
+    assert turned_about(sample, turn) == name
 
 
 def _arguments(*options: str) -> argparse.Namespace:

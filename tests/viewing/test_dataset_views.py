@@ -41,6 +41,8 @@ def rigid_sample(seed: int, *, modes: int = 1) -> Sample:
         points=points,
         canonical=np.repeat(canonical[:, None], PAIRS, axis=1).astype(np.float32),
         aligned=np.repeat(rng.random((2, 1, POINTS)) < 0.3, PAIRS, axis=1),
+        present=np.ones((2, PAIRS, POINTS), bool),
+        up=np.zeros((2, PAIRS, 3), np.float32),
         size=np.full((2, PAIRS), 0.2, np.float32),
         mode=np.arange(PAIRS) % modes,
         modes=np.eye(4)[None],
