@@ -16,7 +16,10 @@ from iga_drake.dataset.splits import SampleSet
 from iga_drake.shapes.families import FAMILIES
 
 Range = tuple[float, float]
-SIZE_FACTOR = (0.8, 1.25)  # of an instance's natural size, log-uniform
+# How far the products of a sample differ: standard deviation of every parameter about one draw of
+# them, as a share of its range, and factors of the natural size, log-uniform.
+SPREAD = 0.2
+SIZE_FACTOR = (0.85, 1.18)
 
 # Axes of a frame of A, as columns, in those of a frame of B.
 SAME = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -142,9 +145,10 @@ def related_pairs(chosen: SampleSet, k: int, size: Range) -> RelatedPairs:
     vertices, faces, frames = [], [], []
     for role, name in enumerate(category):
         family, instances, own = FAMILIES[name], [], []
+        product = family.sample_parameters(chosen.rng("instances", k, role))
         for n in range(chosen.pairs + 1):
             rng = chosen.rng("instances", k, role, n)
-            draft = family.draft(family.sample_parameters(rng))
+            draft = family.draft(family.vary_parameters(product, rng, SPREAD))
             surface = draft.surface()
             extent = float(np.ptp(surface.vertices, axis=0).max())
             factor = float(np.exp(rng.uniform(*np.log(SIZE_FACTOR))))
