@@ -159,8 +159,8 @@ class FieldConfig:
     """How often clouds are disturbed, and how much; a share of 0 leaves a disturbance out."""
 
     disturbed: float = 0.6  # share of the clouds that anything is done to; of these:
-    half_view: float = 0.3
-    half_view_kept: tuple[float, float] = (0.4, 0.9)
+    half_view: float = 0.45
+    half_view_kept: tuple[float, float] = (0.35, 0.85)
     holes: float = 0.2
     sparse: float = 0.2
     sparse_points: tuple[int, int] = (60, 200)
