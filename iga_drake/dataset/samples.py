@@ -13,6 +13,7 @@ from functools import cache, cached_property, lru_cache
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from iga_drake.dataset.collections import collection_keys, collection_mesh
 from iga_drake.dataset.depth_camera import CALIBRATION, Clouds, observe
@@ -90,6 +91,10 @@ class Sample:
     # (2, S, 2, 3): of the test pair's A and B, in W: points of the surface (m) and unit normals;
     # S = 0 unless the options say `test_surface`.
     surface: np.ndarray = field(default_factory=lambda: np.empty((2, 0, 2, 3), np.float32))
+    # (2, S, 2, 3) m: the same points and their normals on the canonical instances, in their frames.
+    canonical_surface: np.ndarray = field(
+        default_factory=lambda: np.empty((2, 0, 2, 3), np.float32)
+    )
 
     @property
     def symmetries(self) -> tuple[Symmetry, Symmetry]:
@@ -99,11 +104,34 @@ class Sample:
     @cached_property
     def found_symmetries(self) -> tuple[np.ndarray, np.ndarray]:
         """Of the test pair's A and B, in W: motions (n, 4, 4) that carry the surface onto itself,
-        found in `surface`; the identity is the first, and the only one where there is none."""
+        found in `surface`; the identity is the first, and the only one where there is none.
+
+        Instances of a composite are one form under deformations that tell nothing of it: what
+        carries the canonical one onto itself counts as well, as near as the test instance has it.
+        """
         if not self.surface.shape[1]:
             return np.eye(4)[None], np.eye(4)[None]
-        A, B = (find_symmetries(*np.moveaxis(each, 1, 0)) for each in self.surface)
+        A, B = (self._found(role) for role in range(2))
         return A, B
+
+    def _found(self, role: int) -> np.ndarray:
+        own = find_symmetries(*np.moveaxis(self.surface[role], 1, 0))
+        if self.category[role] != COMPOSITE:
+            return own
+        points, normals = np.moveaxis(self.canonical_surface[role], 1, 0)
+        turns = find_symmetries(points, normals)[1:]
+        return np.concatenate((own, _carried(turns, points, self.surface[role, :, 0])))
+
+
+def _carried(turns: np.ndarray, canonical: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Motions (n, 4, 4) of a deformed instance's points (S, 3) that do to it what `turns` (n, 4, 4)
+    do to the canonical one's points (S, 3)."""
+    tree = cKDTree(canonical)
+    motions = np.tile(np.eye(4), (len(turns), 1, 1))
+    for motion, X in zip(motions, turns, strict=True):
+        _, to = tree.query(canonical @ X[:3, :3].T + X[:3, 3])
+        motion[:3, :3], motion[:3, 3] = rigid_fit(points, points[to])
+    return motions
 
 
 @dataclass(frozen=True)
@@ -517,8 +545,9 @@ def _observe(
         aligned = np.take_along_axis(aligned, taken, 2) & present
     test_A, test_B = poses[:, -1]
     surface = np.stack((points[-1], normals[-1]), 2).astype(np.float32)
+    canonical_surface = np.stack([np.stack((o.points[0], o.normals[0]), 1) for o in objects])
     if not config.test_surface:
-        surface = surface[:, :0]
+        surface, canonical_surface = surface[:, :0], canonical_surface[:, :0]
     return Sample(
         points=observed,
         canonical=place,
@@ -531,6 +560,7 @@ def _observe(
         axes=np.stack([_move_axis(poses[role, -1], objects[role].axis) for role in range(2)]),
         category=(objects[0].category, objects[1].category),
         surface=surface,
+        canonical_surface=canonical_surface.astype(np.float32),
     )
 
 

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from iga_drake.dataset.alignment_error import displacement, nearest_valid, random_pose
+from iga_drake.dataset.alignment_error import CONFIG, displacement, nearest_valid, random_pose
+from iga_drake.dataset.samples import make_sample
 
 
 def test_displacement_is_how_far_the_points_are_off_on_average() -> None:
@@ -28,3 +30,23 @@ def test_the_nearest_of_the_valid_motions_counts() -> None:
         off[:3, 3] += (0.0, 0.003, 0.004)
         np.testing.assert_array_equal(nearest_valid(off, valid, cloud), valid[k])
         assert displacement(off, valid, cloud) == pytest.approx(0.005)
+
+
+def test_a_composite_keeps_the_symmetry_of_its_form_when_deformed() -> None:
+    """A ball with a loop: half a turn about the line through both, though the test instance is
+    bent; what the turn makes of it lies nearer to it than what any other half-turn makes."""
+    sample = make_sample("unseen_instances", 51, CONFIG)
+    assert sample.category[0] == "composite"
+    identity, turn = sample.found_symmetries[0]
+    np.testing.assert_array_equal(identity, np.eye(4))
+    assert np.degrees(Rotation.from_matrix(turn[:3, :3]).magnitude()) > 170
+    points = sample.surface[0, :, 0].astype(np.float64)
+    tree, centre = cKDTree(points), points.mean(0)
+    off = tree.query(points @ turn[:3, :3].T + turn[:3, 3])[0].mean()
+    axes = np.linalg.eigh(np.cov(points.T))[1].T
+    others = [
+        tree.query((points - centre) @ (2 * np.outer(a, a) - np.eye(3)) + centre)[0].mean()
+        for a in axes
+        if abs(a @ Rotation.from_matrix(turn[:3, :3]).as_rotvec()) < 1.0
+    ]
+    assert len(others) == 2 and off < 0.6 * min(others)
