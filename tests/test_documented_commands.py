@@ -19,7 +19,7 @@ def iga(capsys: pytest.CaptureFixture, *arguments: object) -> str:
 
 
 def test_shapes(capsys, tmp_path: Path) -> None:
-    assert "45 families" in iga(capsys, "shapes", "list")
+    assert "48 families" in iga(capsys, "shapes", "list")
     assert "mug_3.sdf" in iga(capsys, "shapes", "sdf", "mug", "--seed", 3, "--out", tmp_path)
     iga(capsys, "view", "shapes", "--family", "hat", "--count", 6, "--out", tmp_path)
     sheet = np.asarray(Image.open(tmp_path / "hat.png"))

@@ -2,8 +2,8 @@
 
 Both objects stand upright on a table when they are seen, but for those that `Relation.upright`
 names; A then goes to where a frame of it meets a frame of B, up to one offset that all pairs of a
-sample share (the height of a spout over an opening, say). All pairs show different products:
-independent parameters and sizes.
+sample share (the height of a spout over an opening, say). All pairs show different products, in
+parameters and sizes.
 """
 
 from collections.abc import Mapping

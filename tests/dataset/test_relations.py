@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from iga_drake.dataset.alignment_error import CONFIG
 from iga_drake.dataset.foreign import foreign_sample
-from iga_drake.dataset.relations import RELATIONS, related_pairs
+from iga_drake.dataset.relations import RELATIONS, SPREAD, related_pairs
 from iga_drake.dataset.samples import SIZE, canonical_mesh, category_names, make_sample
 from iga_drake.dataset.splits import held_out_families, sample_set
 from iga_drake.shapes.families import FAMILIES
@@ -40,8 +40,9 @@ def test_frames_meet_up_to_one_offset_in_all_pairs() -> None:
             X_OF = []
             for role, families in enumerate((relation.grasped, relation.target)):
                 family = FAMILIES[pairs.category[role]]
+                product = family.sample_parameters(SET.rng("instances", k, role))
                 rng = SET.rng("instances", k, role, n)
-                draft = family.draft(family.sample_parameters(rng))
+                draft = family.draft(family.vary_parameters(product, rng, SPREAD))
                 own, made = draft.surface().vertices, pairs.vertices[role][n]
                 factor = np.ptp(made) / np.ptp(own)
                 np.testing.assert_allclose(made, factor * own, atol=1e-9)

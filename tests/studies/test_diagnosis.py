@@ -81,7 +81,7 @@ def test_a_hypothesis_turned_by_an_angle_is_off_by_it(
     matches = list(informed.matches)
     matches[role] = [replace(m, R_DT=turn @ m.R_DT) for m in matches[role]]
     turned, _ = hypothesis_errors(
-        problem, replace(informed, matches=(matches[0], matches[1])), role, 1
+        problem, replace(informed, find_matches=lambda: (matches[0], matches[1])), role, 1
     )
     assert abs(turned[0] - 2.0) <= off[0] + 1e-6
 

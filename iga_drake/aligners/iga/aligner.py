@@ -270,7 +270,9 @@ class IgaAligner:
         familiarity = None
         if self._energy is not None:
             prepared = self._energy(
-                pair_proposals(A, B, nodes_A, nodes_B, self._energy.config, self.voting)
+                pair_proposals(
+                    A, B, nodes_A, nodes_B, self._energy.config, self.voting, trimmed=True
+                )
             )
             if self.config.ranking == "energy":
                 X, energies = minimise(prepared, also=voted, config=self.search)

@@ -152,17 +152,21 @@ def pair_proposals(
     nodes_B: Tensor,
     config: EnergyConfig,
     voting: VotingConfig,
+    *,
+    trimmed: bool = False,
 ) -> PairProposals:
     """Prepares a problem.
 
     A, B: the matches of both objects, one per demonstration; nodes_A, nodes_B (M, 3) the nodes of
-    the test clouds about their centroids, m.
+    the test clouds about their centroids, m. All problems of a configuration have one shape, unless
+    `trimmed` leaves out the combinations that no demonstration has: they would weigh nothing.
     """
     P = min(config.parts, A[0].X_DT.shape[1])
     Q = min(config.parts, B[0].X_DT.shape[1])
-    # No more combinations than some demonstration has: the others would weigh nothing.
-    most = max(len(a.log_likelihood) * len(b.log_likelihood) for a, b in zip(A, B, strict=True))
-    D, C = len(A), min(config.combinations, most)
+    D, C = len(A), config.combinations
+    if trimmed:
+        counts = (len(a.log_likelihood) * len(b.log_likelihood) for a, b in zip(A, B, strict=True))
+        C = min(C, max(counts))
     extents = (
         _extent(nodes_A, P, voting.neighbourhood) / 0.05,
         _extent(nodes_B, Q, voting.neighbourhood) / 0.05,
