@@ -116,7 +116,7 @@ class Sample:
 
     def _found(self, role: int) -> np.ndarray:
         own = find_symmetries(*np.moveaxis(self.surface[role], 1, 0))
-        if self.category[role] != COMPOSITE:
+        if self.category[role] != COMPOSITE or not self.canonical_surface.shape[1]:
             return own
         points, normals = np.moveaxis(self.canonical_surface[role], 1, 0)
         turns = find_symmetries(points, normals)[1:]
