@@ -49,8 +49,8 @@ def equivalents(sample: Sample, *, symmetry: bool) -> np.ndarray:
 
 
 def known_symmetries(sample: Sample) -> tuple[np.ndarray, np.ndarray]:
-    """Of the test pair's A and B, in W: motions (n, 4, 4) that carry the object onto itself, the
-    family's and those found on its surface; the identity is the first."""
+    """Motions (n, 4, 4) in W that carry the test pair's A, and B, onto itself: the family's and
+    those found on its surface, the identity first."""
     of_A, of_B = (
         np.concatenate((_turns(group, axis), found[1:]))
         for group, axis, found in zip(

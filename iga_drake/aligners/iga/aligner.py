@@ -82,7 +82,8 @@ class Explanation:
 
     @cached_property
     def matches(self) -> tuple[list[Match], list[Match]]:
-        """Of both objects with every demonstration; test nodes about their cloud's centroid."""
+        """The matches of A and of B with every demonstration; test nodes lie about the centroid of
+        their cloud."""
         return self.find_matches()
 
 
@@ -103,7 +104,7 @@ class _Described:
 
 
 def _known_ups(context: Sequence[Alignment]) -> list[bool]:
-    """Whether all demonstrations have the grasped and the target object's way up."""
+    """For the grasped and for the target object: whether all demonstrations have its way up."""
     return [all(getattr(alignment, name) is not None for alignment in context) for name in UPS]
 
 

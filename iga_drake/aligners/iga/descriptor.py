@@ -190,7 +190,7 @@ class CrossLayer(nn.Module):
 
 
 class Description(NamedTuple):
-    """What the network says of the nodes of B clouds, and what other clouds can attend to."""
+    """The network's output for the nodes of B clouds, with what test clouds attend to."""
 
     descriptors: Tensor  # (B, M, D) unit
     presence: Tensor  # (B, M) logits that a node lies on the object, not on what surrounds it

@@ -81,7 +81,7 @@ class VotingConfig:
         )
 
     def tilt_penalty(self, tilt: Tensor) -> Tensor:
-        """What a tilt (rad) takes from a hypothesis' mean log-likelihood."""
+        """The amount by which a tilt (rad) lowers a hypothesis' mean log-likelihood."""
         return 0.5 * (tilt / self.sigma_tilt).square() / self.hypothesis
 
 
@@ -459,8 +459,11 @@ def match_objects(
 def _combine(
     A: list[Match], B: list[Match], config: VotingConfig
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Of C combinations of hypotheses in each demonstration: the motions of A's parts and those of
-    B's, inverted, (D, C, P or Q, 4, 4); log weights (D, C, P, Q) and distances of the parts."""
+    """Combines hypotheses of A and of B, C combinations in each of D demonstrations.
+
+    Returns the motions of A's parts (D, C, P, 4, 4), the inverse motions of B's (D, C, Q, 4, 4),
+    log weights (D, C, P, Q) and distances of the parts (D, C, P, Q).
+    """
     most = max(2, min(config.combinations, config.all_combinations // len(A)))
     chosen, priors = [], []
     for a, b in zip(A, B, strict=True):
