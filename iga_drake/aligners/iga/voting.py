@@ -39,7 +39,8 @@ class VotingConfig:
     likeliest: int = 12
     # Whether the best one's half-turns about the principal axes are tried too.
     half_turns: bool = True
-    iterations: int = 3  # of refinement
+    iterations: int = 3  # of refinement, by the first nodes alone
+    refining: int = 32
     # Where up is known: no hypothesis tilts it by more, and all count less the more they do:
     # exp(-(tilt / sigma_tilt)^2 / 2) in the vote. rad.
     tilt: float = math.radians(45)
@@ -352,18 +353,20 @@ def global_hypotheses(
     columns, nodes = _after(y, config.coarse_sigma), x[:, None]
     S = X.shape[1]
 
-    def likely_matches() -> Tensor:  # (B, S M, N)
-        exponent = _before(transform(X, nodes).flatten(1, 2)) @ columns
-        exponent.view(B, S, M, N).add_(log_p[:, None])
+    def likely_matches(count: int) -> Tensor:  # (B, S count, N), of the first nodes
+        exponent = _before(transform(X, nodes[:, :, :count]).flatten(1, 2)) @ columns
+        exponent.view(B, S, count, N).add_(log_p[:, None, :count])
         return exponent.exp_()
 
+    some = min(M, config.refining)
     for _ in range(config.iterations):
-        sums = (likely_matches() @ with_one).view(B, S, M, 4)
+        sums = (likely_matches(some) @ with_one).view(B, S, some, 4)
         soft, likelihood = sums[..., :3] / sums[..., 3:].clamp_min(1e-37), _log(sums[..., 3])
         weight = (likelihood - likelihood.amax(-1, keepdim=True)).exp().clamp_min(1e-3).sqrt()
-        X = kabsch(nodes.expand(-1, S, -1, -1), soft, weight * share_x[:, None])
+        weight = weight * share_x[:, None, :some]
+        X = kabsch(nodes[:, :, :some].expand(-1, S, -1, -1), soft, weight)
         X = _upright(X, up, config.tilt)
-    likely = likely_matches().sum(-1).view(B, S, M)
+    likely = likely_matches(M).sum(-1).view(B, S, M)
     tilt = _tilt(X[..., :3, :3], up)
     score = (_log(likely) * share_x[:, None]).sum(-1) - config.tilt_penalty(tilt)
     flat = X[..., :3, :3].flatten(2)

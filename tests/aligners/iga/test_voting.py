@@ -216,7 +216,7 @@ def test_up_chooses_among_half_turns() -> None:
     assert float(unknown.abs().diagonal().sum()) == pytest.approx(3, abs=1e-3)  # one of the four
     tilts, best = found(up @ start[:3, :3].T)
     assert (tilts > math.cos(CONFIG.tilt) - 1e-4).all()
-    torch.testing.assert_close(best, torch.eye(3).double(), atol=1e-3, rtol=0)
+    torch.testing.assert_close(best, torch.eye(3).double(), atol=1e-2, rtol=0)
     # The other way up: another of the four.
     turned = up * torch.tensor([-1.0, 1.0, -1.0])
     tilts, best = found(turned @ start[:3, :3].T)
