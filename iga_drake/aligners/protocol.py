@@ -14,12 +14,12 @@ demonstrations have it, and otherwise changes nothing. An aligner may leave it u
 
 import inspect
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from iga_drake.demonstrations.alignment import Alignment
-from iga_drake.errors import IgaDrakeError
+from iga_drake.errors import IgaDrakeError, shortened
 
 
 class AlignerError(IgaDrakeError):
@@ -28,7 +28,11 @@ class AlignerError(IgaDrakeError):
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """Poses `X_WF` best first, with their energies and the probability of each mode."""
+    """Poses `X_WF` best first, with their energies and the probability of each mode.
+
+    Raises `AlignerError` where a shape is wrong, a number isn't finite, a pose isn't rigid (within
+    1e-6), a probability is below 0, or the familiarity lies outside of [0, 1].
+    """
 
     poses: np.ndarray  # (M, 4, 4) float64
     energies: np.ndarray  # (M,) ascending
@@ -38,17 +42,71 @@ class PoseEstimate:
     familiarity: float | None = None
 
     def __post_init__(self) -> None:
-        poses = np.asarray(self.poses, dtype=np.float64)
+        poses = self._numbers("poses")
         if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
             raise AlignerError(f"PoseEstimate.poses: expected (M>=1, 4, 4), got {poses.shape}")
-        object.__setattr__(self, "poses", poses)
         for name in ("energies", "probabilities"):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
+            value = self._numbers(name)
             if value.shape != (len(poses),):
                 raise AlignerError(
                     f"PoseEstimate.{name}: expected ({len(poses)},), got {value.shape}"
                 )
             object.__setattr__(self, name, value)
+        for name, value in (("poses", poses), *((n, getattr(self, n)) for n in _WEIGHTS)):
+            if not np.isfinite(value).all():
+                bad = int((~np.isfinite(value)).sum())
+                raise AlignerError(
+                    f"PoseEstimate.{name}: {bad} of {value.size} numbers are not finite"
+                )
+        if (self.probabilities < 0).any():
+            raise AlignerError(f"PoseEstimate.probabilities: {self.probabilities.min():g} is < 0")
+        R = poses[:, :3, :3]
+        off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max()
+        off = max(off, np.abs(poses[:, 3] - [0, 0, 0, 1]).max())
+        if not off <= _RIGID or not (np.linalg.det(R) > 0).all():
+            raise AlignerError(
+                f"PoseEstimate.poses: not rigid transforms (off by {off:.2g}): expected rotation "
+                "matrices of determinant 1 over rows (0, 0, 0, 1)"
+            )
+        poses = poses.copy()
+        poses[:, 3] = [0, 0, 0, 1]
+        object.__setattr__(self, "poses", poses)
+        if self.familiarity is not None:
+            familiarity = self._numbers("familiarity")
+            if familiarity.shape != () or not 0 <= familiarity <= 1:
+                raise AlignerError(
+                    f"PoseEstimate.familiarity: {shortened(self.familiarity)}, a number from 0 to "
+                    "1, or None, expected"
+                )
+            object.__setattr__(self, "familiarity", float(familiarity))
+
+    def _numbers(self, name: str) -> np.ndarray:
+        """The field as float64."""
+        value = getattr(self, name)
+        try:
+            return np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise AlignerError(
+                f"PoseEstimate.{name}: {type(value).__name__} found, numbers expected"
+            ) from error
+
+    @staticmethod
+    def of(found: Any) -> "PoseEstimate":
+        """What an aligner returned, whatever it is, as an estimate. Raises `AlignerError` for what
+        is none."""
+        missing = [name for name in ("poses", *_WEIGHTS) if not hasattr(found, name)]
+        if missing:
+            raise AlignerError(
+                f"returned {type(found).__name__}, a PoseEstimate is expected (it has no "
+                f"{', '.join(missing)})"
+            )
+        return PoseEstimate(
+            found.poses, found.energies, found.probabilities, getattr(found, "familiarity", None)
+        )
+
+
+_WEIGHTS = ("energies", "probabilities")
+_RIGID = 1e-6
 
 
 @runtime_checkable

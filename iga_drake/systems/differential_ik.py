@@ -52,7 +52,8 @@ class DifferentialIkConfig:
 
 
 class JointIntegrator(LeafSystem):
-    """Integrates joint velocities from where the joints are measured at the first update on.
+    """Integrates joint velocities from where the joints are measured at the first update on that
+    finds them finite.
 
     .. pydrake_system::
 
@@ -86,8 +87,10 @@ class JointIntegrator(LeafSystem):
         return position if np.isfinite(position).all() else self._measured_input.Eval(context)
 
     def _update(self, context: Context, values: Any) -> None:
-        step = self._period * self._velocity_input.Eval(context)
-        values.set_value(self._state, self._position(context) + step)
+        position = self._position(context)
+        if np.isfinite(position).all():  # no velocity follows from what isn't
+            step = self._period * self._velocity_input.Eval(context)
+            values.set_value(self._state, position + step)
 
     def _calc_position(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._position(context))

@@ -157,10 +157,10 @@ class Supervisor(LeafSystem):
         the commanded motion. The reason is empty if nothing is wrong."""
         config, limits = self._config, self._limits
         for name, value in (
-            ("position_commanded", command),
             ("position_measured", position),
             ("velocity_measured", velocity),
             ("torque_external", torque),
+            ("position_commanded", command),
         ):
             if not np.isfinite(value).all():
                 return Cause.IK, f"{name} isn't finite: {value}"

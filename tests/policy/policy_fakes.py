@@ -76,7 +76,8 @@ class FakeInputs:
     """A world where every target is reached one tick after it is set."""
 
     clouds: dict = field(default_factory=lambda: {"target": TARGET, "grasped": TARGET})
-    silent: dict = field(default_factory=dict)
+    counts: dict = field(default_factory=dict)
+    lost: str = ""
     X_WE: RigidTransform = X_PRESENT
     follower_status: FollowerStatus = field(default_factory=FollowerStatus)
     supervisor_status: SupervisorStatus = field(default_factory=SupervisorStatus)
@@ -86,8 +87,11 @@ class FakeInputs:
         self.pulled.append(role)
         return self.clouds[role]
 
-    def silent_cameras(self):
-        return self.silent
+    def cameras(self):
+        return self.counts
+
+    def losses(self, role):
+        return self.lost
 
     def pose(self):
         return self.X_WE

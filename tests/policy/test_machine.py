@@ -24,6 +24,7 @@ from iga_drake.aligners.protocol import AlignerError, PoseEstimate
 from iga_drake.policy.inference import LocalInference
 from iga_drake.policy.machine import PolicyMachine
 from iga_drake.policy.motion import Phase, PolicyError, TaskMotion
+from iga_drake.systems.fusion import CameraCounts
 from iga_drake.systems.messages import Cause, FollowerStatus, SupervisorStatus
 
 
@@ -169,7 +170,7 @@ def test_a_better_second_look_is_taken():
         ({"clouds": {"target": np.zeros((0, 3))}}, "cloud of 'pan' is empty"),
         ({"clouds": {"target": np.full((400, 3), np.nan)}}, "'pan' has 0 usable points"),
         ({"clouds": {"target": TARGET[:20]}}, "20 usable points"),
-        ({"silent": {"camera_1": "is off"}}, "camera_1 is off"),
+        ({"counts": {"camera_1": CameraCounts(0, 0, 0, "is off")}}, "camera_1 is off"),
     ],
 )
 def test_bad_observations_are_refused_and_the_arm_held(changes, reason):
@@ -220,7 +221,7 @@ def test_poses_that_are_not_finite_are_refused():
 
 def test_objects_that_look_like_none_of_the_demonstrations_are_refused_where_asked():
     for familiarity, least, refused in (
-        (0.2, 0.0, False), (0.2, 0.5, True), (None, 0.5, False), (np.nan, 0.5, True),
+        (0.2, 0.0, False), (0.2, 0.5, True), (None, 0.5, False),
     ):  # fmt: skip
         aligner = FakeAligner(familiarity=familiarity)
         machine = make_machine(aligner=aligner, minimum_familiarity=least)
