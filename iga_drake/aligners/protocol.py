@@ -13,12 +13,13 @@ demonstrations have it, and otherwise changes nothing. An aligner may leave it u
 """
 
 import inspect
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from iga_drake.demonstrations.alignment import Alignment
+from iga_drake.demonstrations.alignment import Alignment, check_cloud
 from iga_drake.errors import IgaDrakeError, shortened
 
 
@@ -131,11 +132,54 @@ class Aligner(Protocol):
         """Aligns `grasped` (P, 3) with `target` (Q, 3) as in `context` (one or more alignments).
 
         `grasped_up` and `target_up` (3,) are the objects' ways up, None where unknown.
-        Deterministic for a seed. Raises `AlignerError` for an empty context, and `CloudError`
-        (`demonstrations.alignment`) for clouds that are empty, not finite or too small, and for
-        directions that are no unit vectors.
+        Deterministic for a seed. Raises `AlignerError` for a context, a seed or a cloud's size that
+        can't be (`check_question`), and `CloudError` (`demonstrations.alignment`) for clouds that
+        are empty, not finite or have too few points, and for directions that are no unit vectors.
         """
         ...
+
+
+def check_question(
+    name: str,
+    context: Sequence[Alignment],
+    grasped: np.ndarray,
+    target: np.ndarray,
+    *,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The clouds of a question to the aligner `name`, as finite float64 arrays (P, 3) and (Q, 3).
+
+    Raises `AlignerError`, which begins with `name`, for a context that is empty or holds something
+    else than alignments, for a seed below 0, and for a cloud that is `MOST_TIMES` as large or small
+    as those of the demonstrations; `CloudError` for a cloud that can't be used.
+    """
+    if not context:
+        raise AlignerError(f"{name}: the context is empty: give at least one demonstration")
+    for alignment in context:
+        if not isinstance(alignment, Alignment):
+            raise AlignerError(
+                f"{name}: the context holds {type(alignment).__name__}, alignments are expected"
+            )
+    if not (isinstance(seed, int | np.integer) and 0 <= seed < 2**63):
+        raise AlignerError(f"{name}: seed {shortened(seed)}, an integer from 0 to 2^63 expected")
+    clouds = check_cloud(grasped, "grasped"), check_cloud(target, "target")
+    for role, cloud in zip(("grasped", "target"), clouds, strict=True):
+        size = _size(cloud)
+        shown = float(np.median([_size(getattr(alignment, role)) for alignment in context]))
+        if not shown / MOST_TIMES <= size <= shown * MOST_TIMES:
+            raise AlignerError(
+                f"{name}: the cloud '{role}' is {size:.3g} m large, in the demonstrations "
+                f"{shown:.3g} m: are both in m?"
+            )
+    return clouds
+
+
+MOST_TIMES = 10.0  # how many times as large or small as in the demonstrations a cloud may be
+
+
+def _size(cloud: np.ndarray) -> float:
+    """m, twice the median distance of the points from their middle; stray points don't count."""
+    return 2 * float(np.median(np.linalg.norm(cloud - np.median(cloud, axis=0), axis=1)))
 
 
 def check_aligns(aligner: Aligner, name: str) -> None:

@@ -16,7 +16,6 @@ from iga_drake.errors import IgaDrakeError, check_range, shortened
 from iga_drake.geometry.voxels import voxelize
 from iga_drake.systems.ports import Role
 
-
 # Depths (m) that a camera in a robot's cell can measure.
 _NEAREST, _FARTHEST = 0.01, 20.0
 _RIGID = 1e-4
@@ -172,8 +171,8 @@ class PointCloudFusion(LeafSystem):
     crop box are dropped; the rest is unprojected into W, averaged by voxel, and specks are removed.
     Each camera is looked at by itself, and one with a problem gives no points: no image, an old one
     or one of the future, images of another size than the intrinsics', nearly no depth, depth in
-    other units, labels that are no roles, a pose that isn't rigid. All outputs come from one cached calculation and are pure
-    functions of the inputs and of the time.
+    other units, labels that are no roles, a pose that isn't rigid. All outputs come from one cached
+    calculation and are pure functions of the inputs and of the time.
 
     .. pydrake_system::
 
@@ -328,7 +327,7 @@ class PointCloudFusion(LeafSystem):
             return "delivered no depth: check the camera and its connection"
         return (
             f"delivered a depth in {100 * share:.2g} % of its pixels, at least "
-            f"{100 * self._config.minimum_valid:g} % are needed: is it covered, too near or dazzled?"
+            f"{100 * self._config.minimum_valid:g} % are needed: is it covered or dazzled?"
         )
 
     def _unproject(
