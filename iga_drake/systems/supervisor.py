@@ -124,7 +124,7 @@ class Supervisor(LeafSystem):
         command = np.array(self._commanded_input.Eval(context))
         torque = self._torque_input.Eval(context)
         overloaded = None
-        if (np.abs(torque) > self._config.torque_limit).any():
+        if not (np.abs(torque) <= self._config.torque_limit).all():
             overloaded = memory.time_overloaded
             overloaded = context.get_time() if overloaded is None else overloaded
         last = self._first_position(context) if memory.position is None else memory.position
@@ -213,7 +213,7 @@ class Supervisor(LeafSystem):
 
 def _outside(name: str, unit: str, value: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> str:
     """Says which joint's `value` is outside of its bounds; empty if none is."""
-    bad = np.flatnonzero((value < lower) | (value > upper))
+    bad = np.flatnonzero(~((value >= lower) & (value <= upper)))
     if len(bad) == 0:
         return ""
     joint = int(bad[0])
