@@ -1,6 +1,8 @@
 """The base of every error that this package raises on purpose."""
 
 import reprlib
+from collections.abc import Mapping
+from typing import Any
 
 TEXT_LIMIT = 2000  # characters of an error in one line
 
@@ -41,6 +43,16 @@ _SHORT = _short()
 
 class ConfigError(IgaDrakeError):
     """A setting is out of its range; the message names it by its full key."""
+
+
+def check_bounds(config: object, where: str, bounds: Mapping[str, tuple[float, float]]) -> None:
+    """Raises `ConfigError` for a field of `config`, a number or a list of numbers, that isn't
+    within its bounds, both allowed; `bounds` by the fields' names."""
+    for name, (low, high) in bounds.items():
+        value: Any = getattr(config, name)
+        values = value if isinstance(value, list | tuple) else [value]
+        ok = all(low <= each <= high for each in values)
+        check_range(ok, f"{where}.{name}", value, f"{low:g} to {high:g}")
 
 
 def check_range(ok: bool, key: str, value: object, allowed: str) -> None:

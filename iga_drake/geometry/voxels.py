@@ -70,8 +70,8 @@ def voxelize(points: np.ndarray, voxel_size: float) -> VoxelGrid:
     shape = np.floor(xyz.max(axis=1) * inverse) + 1 - lower + 1
     if not np.prod(shape.astype(float)) <= _MOST_CELLS:
         raise VoxelError(
-            f"a cloud of {shape[0]:g} x {shape[1]:g} x {shape[2]:g} voxels of {voxel_size} m: crop it to "
-            "the work area or take larger voxels"
+            f"a cloud of {shape[0]:g} x {shape[1]:g} x {shape[2]:g} voxels of {voxel_size} m: "
+            "crop it to the work area or take larger voxels"
         )
     shape = shape.astype(np.int64)
     strides = (int(shape[1] * shape[2]), int(shape[2]), 1)

@@ -21,7 +21,7 @@ from pydrake.math import RigidTransform
 
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.demonstrations.demonstration import DemonstrationSet, Observation, ObservedRole
-from iga_drake.errors import check_range, error_text
+from iga_drake.errors import check_bounds, check_range, error_text
 from iga_drake.policy.inference import Inference
 from iga_drake.policy.motion import (
     MotionStep,
@@ -91,16 +91,19 @@ class PolicyConfig:
 
     def check(self, where: str = "policy") -> None:
         """Raises `ConfigError` for a value out of range."""
-        for name in (
-            "period", "observe_retry", "observe_limit", "present_limit", "move_limit", "infer_limit"
-        ):  # fmt: skip
-            value = getattr(self, name)
-            check_range(value > 0, f"{where}.{name}", value, "> 0")
-        for name in ("observe_settle", "infer_delay", "minimum_points"):
-            value = getattr(self, name)
-            check_range(value >= 0, f"{where}.{name}", value, ">= 0")
-        least = self.minimum_familiarity
-        check_range(0 <= least <= 1, f"{where}.minimum_familiarity", least, "0..1")
+        bounds = {
+            "period": (1e-3, 1.0),
+            "observe_settle": (0.0, 60.0),
+            "observe_retry": (1e-3, 60.0),
+            "minimum_points": (0, 100_000),
+            "infer_delay": (0.0, 60.0),
+            "minimum_familiarity": (0.0, 1.0),
+        }
+        for name in ("observe_limit", "present_limit", "move_limit", "infer_limit"):
+            bounds[name] = (1e-9, 3600.0)
+        if self.minimum_cameras is not None:
+            bounds["minimum_cameras"] = (1, 64)
+        check_bounds(self, where, bounds)
         ways = ", ".join(INFERENCE_WAYS)
         check_range(self.inference in INFERENCE_WAYS, f"{where}.inference", self.inference, ways)
 

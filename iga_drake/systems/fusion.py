@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context, LeafSystem, ValueProducer
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I
 from scipy.ndimage import binary_dilation
 
-from iga_drake.errors import IgaDrakeError, check_range, shortened
+from iga_drake.errors import IgaDrakeError, check_bounds, check_range, shortened
 from iga_drake.geometry.voxels import voxelize
 from iga_drake.systems.ports import Role
 
@@ -47,11 +47,20 @@ class FusionConfig:
 
     def check(self, where: str = "fusion") -> None:
         """Raises `ConfigError` for a value out of range."""
-        for name in ("voxel_size", "depth_jump", "min_cluster", "maximum_age"):
-            check_range(getattr(self, name) > 0, f"{where}.{name}", getattr(self, name), "> 0")
-        check_range(self.erosion >= 0, f"{where}.erosion", self.erosion, ">= 0")
-        share = self.minimum_valid
-        check_range(0 < share <= 1, f"{where}.minimum_valid", share, "above 0, at most 1")
+        check_bounds(
+            self,
+            where,
+            {
+                "voxel_size": (5e-4, 0.1),
+                "crop_lower": (-10.0, 10.0),
+                "crop_upper": (-10.0, 10.0),
+                "erosion": (0, 50),
+                "depth_jump": (1e-4, 10.0),
+                "min_cluster": (1, 100_000),
+                "maximum_age": (1e-3, 3600.0),
+                "minimum_valid": (1e-6, 1.0),
+            },
+        )
         lower, upper = self.crop_lower, self.crop_upper
         ordered = len(lower) == len(upper) == 3 and all(
             low < up for low, up in zip(lower, upper, strict=True)

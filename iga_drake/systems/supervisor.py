@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
-from iga_drake.errors import check_range
+from iga_drake.errors import check_bounds, check_range
 from iga_drake.planning.planning_robot import PlanningRobot
 from iga_drake.systems.messages import Cause, SupervisorStatus
 
@@ -30,18 +30,26 @@ class SupervisorConfig:
 
     def check(self, joints: int, where: str = "supervisor") -> None:
         """Raises `ConfigError` for a value out of range; the robot has this many joints."""
-        scale = self.velocity_scale
-        check_range(0 < scale <= 1, f"{where}.velocity_scale", scale, "above 0, at most 1")
-        for name in ("tracking_error", "torque_time"):
-            check_range(getattr(self, name) > 0, f"{where}.{name}", getattr(self, name), "> 0")
+        check_bounds(
+            self,
+            where,
+            {
+                "velocity_scale": (1e-3, 1.0),
+                "tracking_error": (1e-3, 3.2),
+                "workspace_lower": (-3.0, 3.0),
+                "workspace_upper": (-3.0, 3.0),
+                "torque_limit": (1e-3, 1000.0),
+                "torque_time": (1e-3, 60.0),
+            },
+        )
         lower, upper = self.workspace_lower, self.workspace_upper
         ordered = len(lower) == len(upper) == 3 and all(
             low < up for low, up in zip(lower, upper, strict=True)
         )
         check_range(ordered, f"{where}.workspace_lower", lower, f"3 numbers below {upper}")
         torque = self.torque_limit
-        fits = len(torque) == joints and min(torque) > 0
-        check_range(fits, f"{where}.torque_limit", torque, f"{joints} numbers > 0, one a joint")
+        one_each = len(torque) == joints
+        check_range(one_each, f"{where}.torque_limit", torque, f"{joints} numbers, one a joint")
 
 
 @dataclass(frozen=True)

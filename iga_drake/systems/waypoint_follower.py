@@ -8,7 +8,7 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
-from iga_drake.errors import IgaDrakeError, check_range
+from iga_drake.errors import IgaDrakeError, check_bounds
 from iga_drake.planning.inverse_kinematics import PoseSolver
 from iga_drake.planning.routes import LinePath, Path, plan_path, pose_error
 from iga_drake.systems.messages import NO_TARGET, EndEffectorTarget, FollowerStatus
@@ -36,8 +36,18 @@ class WaypointFollowerConfig:
 
     def check(self, where: str = "control") -> None:
         """Raises `ConfigError` for a value out of range."""
-        for name, value in vars(self).items():
-            check_range(math.isfinite(value) and value > 0, f"{where}.{name}", value, "> 0")
+        check_bounds(
+            self,
+            where,
+            {
+                "period": (1e-3, 0.1),
+                "linear_speed": (1e-3, 2.0),
+                "angular_speed": (1e-3, 5.0),
+                "ramp": (1e-3, 10.0),
+                "position_tolerance": (1e-5, 0.1),
+                "rotation_tolerance": (1e-4, 1.0),
+            },
+        )
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ class Visualization:
     def check(self, where: str = "visualization") -> None:
         """Raises `ConfigError` for a value out of range."""
         period, port = self.publish_period, self.port
-        check_range(period > 0, f"{where}.publish_period", period, "> 0")
+        check_range(1e-3 <= period <= 10, f"{where}.publish_period", period, "0.001 to 10")
         valid = port is None or port == 0 or 1024 <= port <= 65535
         check_range(valid, f"{where}.port", port, "null, 0 (any free one), or 1024..65535")
 

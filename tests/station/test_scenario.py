@@ -169,7 +169,7 @@ def test_wrong_type_names_the_key(tmp_path, text, where):
         ("panda: {visuals: shiny}", "panda.visuals"),
         ("table: {size: [1, 1]}", "table.size"),
         ("table: {size: [1, 1, -1]}", "table.size"),
-        ("cameras: {}", "at least one camera"),
+        ("cameras: {}", "1 to 32 cameras"),
         ("cameras: {a: {pose: {position: [1, 2]}}}", "cameras.a.pose.position"),
         ("cameras: {a: {pose: {position: [1, 2, 3], target: [1, 2, 0]}}}", "cameras.a.pose.target"),
         ("cameras: {a: {near: 4}}", "near < far"),
