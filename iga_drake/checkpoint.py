@@ -32,7 +32,10 @@ def save_checkpoint(path: Path, tensors: dict[str, torch.Tensor], *, kind: str, 
     metadata = {"format": FORMAT, "version": str(VERSION), "kind": kind, "card": json.dumps(card)}
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     with replacing(path) as partial:
-        save_file(plain, partial, metadata)
+        try:
+            save_file(plain, partial, metadata)
+        except SafetensorError as error:
+            raise CheckpointError(f"{path}: can't be written ({error_text(error)})") from error
 
 
 def load_checkpoint(path: Path, *, kind: str) -> tuple[dict[str, torch.Tensor], dict]:
