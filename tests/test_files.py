@@ -79,7 +79,7 @@ def test_outputs_are_known_to_be_writable_before_they_are_written(tmp_path: Path
     check_output_folder(tmp_path / "a" / "b")
     for bad, message in (
         ("folder", "is a folder"), ("file/x.html", "is no folder"), ("/dev/full", "no plain file"),
-        ("x" * 300, "can't be written"), ("nul\0", "can't be written"),
+        ("x" * 300, "can't be written"), ("nul\0", "a null character"),
     ):  # fmt: skip
         with pytest.raises(OutputError, match=message):
             check_output(tmp_path / bad)

@@ -58,6 +58,9 @@ class DifferentialIkConfig:
                 "pose_weight": (1e-3, 1e6),
             },
         )
+        margin, influence = self.position_margin, self.position_influence
+        above = f"above position_margin, {margin:g} rad"
+        check_range(influence > margin, f"{where}.position_influence", influence, above)
         least = f"at least the period of the commands, {period:g} s"
         check_range(self.horizon >= period, f"{where}.horizon", self.horizon, least)
 

@@ -14,7 +14,7 @@ from pydrake.multibody.meshcat import ContactVisualizer, ContactVisualizerParams
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
-from iga_drake.errors import check_range
+from iga_drake.errors import ConfigError, check_range, error_text
 
 
 @dataclass
@@ -40,8 +40,15 @@ class Visualization:
 
 
 def start_meshcat(config: Visualization) -> Meshcat:
-    """Starts a server that only this machine reaches."""
-    return Meshcat(MeshcatParams(host="localhost", port=config.port, show_stats_plot=False))
+    """Starts a server that only this machine reaches. Raises `ConfigError` where its port is taken
+    or none is free."""
+    try:
+        return Meshcat(MeshcatParams(host="localhost", port=config.port, show_stats_plot=False))
+    except RuntimeError as error:
+        raise ConfigError(
+            f"visualization.port: {config.port} can't be used ({error_text(error)}): name another, "
+            "or null for the first free one"
+        ) from error
 
 
 def add_visualizers(

@@ -131,7 +131,14 @@ def make_demonstrations(motion=GRASP, openings=(0.01, 0.06), upright=(True,)) ->
 
 
 def make_machine(
-    motion=GRASP, aligner=None, solve=None, service=None, seed=0, upright=(True,), **config
+    motion=GRASP,
+    aligner=None,
+    solve=None,
+    service=None,
+    seed=0,
+    upright=(True,),
+    workspace=None,
+    **config,
 ):
     demonstrations = make_demonstrations(motion, upright=upright)
     return PolicyMachine(
@@ -141,5 +148,6 @@ def make_machine(
         gripper=lambda opening: GRIPPER,
         solve=solve or (lambda X_WE, near: near),
         config=PolicyConfig(period=0.1, **{"observe_limit": 10.0, **config}),
+        workspace=workspace,
         seed=seed,
     )
