@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch.overrides import TorchFunctionMode
 
 from iga_drake.errors import IgaDrakeError, error_text, shortened
 from iga_drake.files import replacing
@@ -86,16 +87,16 @@ def load_network(
     tensors, card = load_checkpoint(path, kind=kind)
     check_finite(path, tensors)
     try:
-        # Without memory at first: a card may ask for more than there is.
-        with torch.device("meta"):
-            wanted = {name: tuple(t.shape) for name, t in build(card, tensors).state_dict().items()}
+        # A card may ask for more memory than there is.
+        with _Bounded(sum(tensor.numel() for tensor in tensors.values())):
+            net = build(card, tensors)
+        wanted = {name: tuple(tensor.shape) for name, tensor in net.state_dict().items()}
         found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
         for name in sorted({*wanted, *found}):
             if wanted.get(name) != found.get(name):
                 raise CheckpointError(
                     f"'{name}': shape {found.get(name)} found, {wanted.get(name)} expected"
                 )
-        net = build(card, tensors)
         net.load_state_dict(tensors)
     except Exception as error:  # cards are foreign: anything may be in them
         raise CheckpointError(
@@ -104,6 +105,22 @@ def load_network(
         ) from error
     net.eval().requires_grad_(False)
     return net, card
+
+
+class _Bounded(TorchFunctionMode):
+    """Stops what makes far more numbers than a network of so many needs."""
+
+    def __init__(self, numbers: int) -> None:
+        super().__init__()
+        self._left = 100 * numbers + 10_000_000
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        if isinstance(result, torch.Tensor):
+            self._left -= result.numel()
+            if self._left < 0:
+                raise CheckpointError("the card's network is far larger than the file")
+        return result
 
 
 def check_finite(path: Path, tensors: dict[str, torch.Tensor]) -> None:

@@ -146,7 +146,7 @@ class _Left:
         box = f"{list(config.crop_lower)} to {list(config.crop_upper)} m"
         if self.outside is None:
             return f"lie outside fusion.crop_lower to crop_upper, {box}"
-        low, high = (np.round(bound, 2).tolist() for bound in self.outside)
+        low, high = np.round(self.outside.astype(float), 2).tolist()
         return (
             f"lie outside fusion.crop_lower to crop_upper, {box}, at {low} to {high} m: is it in "
             "the work area, and are the cameras' poses right?"
