@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from iga_drake.aligners.protocol import AlignerError
 from iga_drake.geometry.clouds import own_frames
 from iga_drake.geometry.se3 import (
     inverse,
@@ -558,22 +559,26 @@ def _as_points(R: Tensor, place: Tensor, config: VotingConfig) -> Tensor:
 
 def modes(votes: Votes) -> tuple[Tensor, Tensor]:
     """Clusters weighted poses: kernel density, mean shift from the densest, non-maximum
-    suppression. See `vote`."""
+    suppression. See `vote`. Raises `AlignerError` where the votes aren't finite."""
     X, log_weight, centre, config = votes.X, votes.log_weight, votes.centre, votes.config
     at = _as_points(X[:, :3, :3], transform(X, centre[None])[:, 0], config)  # (n, 12)
     weight = (log_weight - log_weight.max()).exp()
+    if not bool(weight.isfinite().all() and at.isfinite().all()):
+        raise AlignerError(
+            "iga: the votes for poses are not finite: are the clouds' sizes those of real objects?"
+        )
     single, share = at.float(), weight.float()
     columns = _after(single, 1.0)
     density = torch.cat([(_before(some) @ columns).exp_() @ share for some in single.split(128)])
-    alive = torch.ones(len(X), dtype=torch.bool)
+    alive = weight > 0  # the best one at least; each round ends one or more
     found: list[Tensor] = []
     energies: list[float] = []
     while len(found) < config.modes and alive.any():
-        seed = int(torch.where(alive, density, torch.zeros_like(density)).argmax())
+        seed = int(density.masked_fill(~alive, -1).argmax())
         mode = at[seed]
         for _ in range(3):
             near = (-0.5 * (at - mode).square().sum(-1)).exp() * weight
-            mode = near @ at / near.sum()
+            mode = near @ at / near.sum().clamp_min(torch.finfo(near.dtype).tiny)
             rotation = nearest_rotation(mode[:9].view(3, 3))
             mode[:9] = rotation.flatten() / (math.sqrt(2) * config.sigma_rotation)
         d2 = (at - mode).square().sum(-1)
@@ -583,7 +588,7 @@ def modes(votes: Votes) -> tuple[Tensor, Tensor]:
         found.append(mode)
         mass = float(((-0.5 * d2).exp() * weight).sum())
         energies.append(-math.log(mass + 1e-30) - float(log_weight.max()))
-        if energies[-1] > energies[0] + 6:
+        if not energies[-1] <= energies[0] + 6:
             break
     best = torch.stack(found)
     rotation = best[:, :9].view(-1, 3, 3) * (math.sqrt(2) * config.sigma_rotation)
