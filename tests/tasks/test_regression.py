@@ -11,7 +11,12 @@ import pytest
 from iga_drake.evaluation.task_success import Trial, evaluate, format_table
 
 # task -> seeds, and how many of them have to succeed.
-CASES = {"grasp": ((3, 4, 5, 6), 3), "stack": ((3, 4, 5, 6), 3)}
+CASES = {
+    "grasp": ((3, 4, 5, 6), 3),
+    "stack": ((3, 4, 5, 6), 3),
+    "hang": ((3,), 1),
+    "insert": ((3,), 1),
+}
 
 
 @pytest.mark.parametrize("task", CASES)
