@@ -75,7 +75,7 @@ _COLORS = ((0.16, 0.24, 0.42), (0.62, 0.2, 0.16), (0.36, 0.42, 0.25), (0.75, 0.6
 _WOODS = ((0.55, 0.38, 0.22), (0.3, 0.2, 0.13), (0.2, 0.21, 0.23))
 
 
-def grip(
+def brim_grip(
     shape: ShapeInstance, *, depth: float, roll: float, turned: bool
 ) -> tuple[RigidTransform, float]:
     """X_OE of a hand that holds a cap by the front of its brim, and the pads' distance (m) then.
@@ -213,7 +213,8 @@ class Hang(Task):
         X_WT = _WORK_AREA.draw_pose(rng, shapes[TARGET].frames["hook_upper"][:3, 3])
         # The cap was put into the hand the way round that suits where the hook points.
         grips = [
-            grip(shapes[HELD], depth=depth, roll=roll, turned=turned) for turned in (False, True)
+            brim_grip(shapes[HELD], depth=depth, roll=roll, turned=turned)
+            for turned in (False, True)
         ]
         poses = self._poses(shapes)
         turns = [wrist_turn(X_WT @ poses[-1] @ X_OE) for X_OE, _ in grips]

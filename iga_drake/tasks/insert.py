@@ -73,7 +73,7 @@ _COLORS = ((0.2, 0.45, 0.3), (0.25, 0.4, 0.62), (0.7, 0.35, 0.15), (0.5, 0.5, 0.
 _LEATHERS = ((0.36, 0.22, 0.14), (0.16, 0.16, 0.17), (0.72, 0.7, 0.66), (0.45, 0.18, 0.16))
 
 
-def grip(shape: ShapeInstance, *, depth: float, yaw: float) -> tuple[RigidTransform, float]:
+def cap_grip(shape: ShapeInstance, *, depth: float, yaw: float) -> tuple[RigidTransform, float]:
     """X_OE of a hand that holds a bottle by its cap from above, and the pads' distance (m) then.
 
     `depth` (m) from the bottle's top to E, `yaw` (rad) of the hand about the bottle's axis.
@@ -176,7 +176,7 @@ class Insert(Task):
 
     def arrange(self, truth: SceneTruth, rng: np.random.Generator, mesh_folder: Path) -> Scene:
         shapes = truth.shapes
-        X_OE, opening = grip(
+        X_OE, opening = cap_grip(
             shapes[HELD], depth=rng.uniform(*_GRIP_DEPTH), yaw=rng.uniform(-np.pi, np.pi)
         )
         X_EO = X_OE.inverse()
