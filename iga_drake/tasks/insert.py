@@ -46,12 +46,15 @@ _ROOM = 0.006  # m between the bottle and the opening on all sides
 _FINGERS = 0.012  # m between the fingers and the opening when the bottle stands in it
 _GRIP_DEPTH = (0.009, 0.011)  # m from the bottle's top to the middle of the pads
 _WORK_AREA = WorkArea(lower=(0.4, -0.3), upper=(0.66, 0.3), reach=(0.42, 0.64))
-# Of the families' ranges, what makes wide shoes and low boots, and bottles that go into them.
+# Of the families' ranges, what makes wide shoes and low boots that stand firm, and bottles that go
+# into them.
 _FOOT = {
     "length": (0.21, 0.24),
     "width": (0.08, 0.095),
     "heel_width": (0.7, 0.85),
     "heel_height": (0.012, 0.025),
+    "arch": (0.0, 0.1),
+    "toe_spring": (0.0, 0.003),
     "opening_width": (0.32, 0.36),
     "collar_slope": (-0.3, 0.6),
 }

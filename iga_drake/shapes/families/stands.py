@@ -33,6 +33,13 @@ def _hook_stand(p: Parameters) -> Draft:
     scale = np.array([0.97, 1.0, 1.0, 0.5 * (1 + p["foot_dome"]), p["foot_dome"]])
     section = superellipse(32, p["foot_exponent"])
     base = loft(rings(section, 0.5 * foot * scale, 0.5 * foot * p["foot_ratio"] * scale, z))
+
+    def foot_pieces() -> list[np.ndarray]:
+        # Quarters, each of which touches the ground at a place of its own.
+        levels, ends = base.vertices[1:-1].reshape(len(z), -1, 3), base.vertices[[0, -1]]
+        quarters = [np.arange(k, k + 9) % 32 for k in (0, 8, 16, 24)]
+        return [np.concatenate([levels[:, q].reshape(-1, 3), ends]) for q in quarters]
+
     pole = p["pole"]
     swell = spline([1.0 + p["pole_root"], 1.0, 1.0, p["pole_top"]], 14)
     stem = tubes(
@@ -83,7 +90,7 @@ def _hook_stand(p: Parameters) -> Draft:
     seat = lines[0, lowest] + [0.0, 0.0, 0.5 * thickness[lowest]]
     return Draft(
         (
-            Part("foot", base, lambda: [base.vertices]),
+            Part("foot", base, foot_pieces),
             Part("stem", stem, hulls(stem, segments=14, lengths=3)),
             Part("hooks", hooks, hulls(hooks, 4, segments=10, lengths=4)),
         ),

@@ -122,7 +122,8 @@ def _footwear(p: Parameters) -> Draft:
 
 
 def _sole_pieces(vertices: np.ndarray, t: np.ndarray) -> Callable[[], list[np.ndarray]]:
-    """Convex pieces of a sole by lengths along it."""
+    """Convex pieces of a sole by lengths along it, the left and the right apart: each touches the
+    ground at a place of its own, so that a shoe stands firm."""
 
     def pieces() -> list[np.ndarray]:
         levels = vertices[1:-1].reshape(-1, len(t), 3)
@@ -132,7 +133,9 @@ def _sole_pieces(vertices: np.ndarray, t: np.ndarray) -> Callable[[], list[np.nd
             # From heel to toe one index on either side: `t` falls from 1 to 0 over the first half.
             near = [int(np.abs(t[: half + 1] - v).argmin()) for v in (a, b)]
             side = np.arange(near[1], near[0] + 1)
-            found.append(levels[:, np.concatenate([side, -side])].reshape(-1, 3))
+            middle = 0.5 * (levels[:, side] + levels[:, -side])
+            for edge in (side, -side):
+                found.append(np.concatenate([levels[:, edge], middle]).reshape(-1, 3))
         return found
 
     return pieces
