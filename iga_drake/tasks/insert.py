@@ -43,7 +43,7 @@ RELEASE_OPENING = 0.07  # m
 _ABOVE, _AT = 0.06, 0.01  # m of the bottle's base above the opening
 _DROP = 0.004  # m from the release to the sole
 _ROOM = 0.006  # m between the bottle and the opening on all sides
-_FINGERS = 0.012  # m between the fingers and the opening when the bottle stands in it
+_FINGERS = (0.012, 0.06)  # m from the shoe to the fingers when the bottle stands in it
 _GRIP_DEPTH = (0.009, 0.011)  # m from the bottle's top to the middle of the pads
 _WORK_AREA = WorkArea(lower=(0.4, -0.3), upper=(0.66, 0.3), reach=(0.42, 0.64))
 # Of the families' ranges, what makes wide shoes and low boots that stand firm, and bottles that go
@@ -52,19 +52,22 @@ _FOOT = {
     "length": (0.21, 0.24),
     "width": (0.08, 0.095),
     "heel_width": (0.7, 0.85),
-    "heel_height": (0.012, 0.025),
+    "heel_height": (0.012, 0.018),
+    "fore_height": (0.010, 0.018),
     "arch": (0.0, 0.1),
     "toe_spring": (0.0, 0.003),
     "opening_width": (0.32, 0.36),
+    "ankle_height": (0.07, 0.085),
     "collar_slope": (-0.3, 0.6),
 }
 _FOOTWEAR = {
-    "shoe": {**_FOOT, "opening_length": (0.17, 0.21)},
-    "boot": {**_FOOT, "opening_length": (0.16, 0.2), "shaft_height": (0.06, 0.09)},
+    "shoe": {**_FOOT, "opening_length": (0.16, 0.19), "shaft_height": (0.014, 0.025)},
+    "boot": {**_FOOT, "opening_length": (0.15, 0.18), "shaft_height": (0.06, 0.09)},
 }
 _BOTTLE = {
     "height": (0.15, 0.24),
     "radius": (0.024, 0.029),
+    "base_ratio": (0.9, 1.0),
     "oval": (0.55, 0.8),
     "neck_ratio": (0.45, 0.6),
     "cap_taper": (0.9, 1.0),
@@ -171,7 +174,7 @@ class Insert(Task):
             if opening_room(bottle, shoe) < _ROOM:
                 continue
             target, held = FAMILIES[family].build(shoe), FAMILIES["bottle"].build(bottle)
-            if finger_height(held, target) >= _FINGERS:
+            if _FINGERS[0] <= finger_height(held, target) <= _FINGERS[1]:
                 return {
                     TARGET: target.with_mass(rng.uniform(*_SHOE_MASS)),
                     HELD: held.with_mass(rng.uniform(*_BOTTLE_MASS)),
