@@ -82,15 +82,15 @@ def test_each_failure_has_its_reason(scene: Scene, change: dict, reason: str) ->
 
 @pytest.mark.parametrize("split", ["demonstration", "test"])
 def test_bottles_have_room_in_their_shoes(split: str) -> None:
-    """By the collision pieces: 3 mm to all sides, from the sole to the opening."""
+    """By the collision pieces: none just above the sole, 3 mm to all sides from there upwards."""
     for shapes in Insert().instances(split)[:6]:
         shoe, bottle = shapes[TARGET], shapes[HELD]
         opening, insole = (shoe.frames[name][:3, 3] for name in ("opening", "insole"))
         deep = opening[2] - insole[2]
         p = bottle.vertices[bottle.vertices[:, 2] < deep]
-        for height in (0.004, 0.5 * deep, deep):
+        for height, room in ((0.004, 0.0), (0.5 * deep, 0.003), (deep, 0.003)):
             for turn in np.arange(4) * np.pi / 2:
-                aside = 0.003 * np.array([np.cos(turn), np.sin(turn), 0.0])
+                aside = room * np.array([np.cos(turn), np.sin(turn), 0.0])
                 standing = p + [*opening[:2], insole[2] + height] + aside
                 assert not inside_pieces(shoe, standing, 0.0).any(), shoe.parameters
 
@@ -125,7 +125,7 @@ def test_the_pads_touch_the_bottle_s_cap_from_both_sides() -> None:
         p = shapes[HELD].parameters
         _, opening = cap_grip(shapes[HELD], depth=0.01, yaw=0.7)
         diameter = 2 * p["cap_ratio"] * p["neck_ratio"] * p["radius"]
-        assert p["cap_taper"] * diameter - 0.002 < opening < diameter + 1e-6 < 0.07
+        assert p["cap_taper"] * diameter - 0.002 < opening < diameter + 0.001 < RELEASE_OPENING
 
 
 def test_the_held_bottle_stays_in_the_hand_by_friction(tmp_path: Path) -> None:
