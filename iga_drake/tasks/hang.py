@@ -31,7 +31,7 @@ from iga_drake.tasks.task import Split, Task
 TARGET, HELD = "target", "grasped"
 SETTLED = 2.0  # s after the release
 TARGET_TILT = np.radians(10.0)
-REST, REST_TIME = 0.003, 0.5  # m moved in so many of the last seconds
+REST, REST_TIME = 0.008, 0.5  # m moved in so many of the last seconds: it may swing a little
 SLIP = 0.015  # m in the hand, on the way
 CONTACT_FORCE = 10.0  # N; the cap is let go where it meets the hook
 RELEASE_OPENING = 0.03  # m

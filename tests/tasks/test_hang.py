@@ -69,7 +69,7 @@ def test_a_cap_left_on_the_stand_for_two_seconds_is_a_success(scene: Scene) -> N
         ({"contacts": lambda t: HANGS | {frozenset((HELD, TABLE))}}, "touches the table"),
         ({"contacts": lambda t: STANDS}, "doesn't hang"),
         ({"target_roll": 0.3}, "stand is tilted"),
-        ({"X_WO": lambda t: RigidTransform([0.01 * t, 0, 0])}, "still moves"),
+        ({"X_WO": lambda t: RigidTransform([0.03 * t, 0, 0])}, "still moves"),
         ({"X_EO": lambda t: RigidTransform([0, 1.2 * SLIP * min(t / 0.9, 1.0), 0])}, "slipped"),
     ],
 )
