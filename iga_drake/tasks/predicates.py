@@ -136,17 +136,21 @@ class WindowPredicate(Predicate):
 
 @dataclass(frozen=True, kw_only=True)
 class Touching(WindowPredicate):
-    """Two of the objects, `ROBOT` and `TABLE` touch at every time of the window."""
+    """Two of the objects, `ROBOT` and `TABLE` touch at every time of the window, or at some time of
+    it: what hangs or leans may rock from one point of contact to another."""
 
     first: str
     second: str
+    # Whether every time of the window counts, else one is enough.
+    always: bool = True
 
     def _judge_window(self, scene: Scene, window: Sequence[Snapshot]) -> Verdict:
         _require_bodies(window[-1], self.first, self.second)
-        if all(snapshot.touches(self.first, self.second) for snapshot in window):
+        touches = [snapshot.touches(self.first, self.second) for snapshot in window]
+        if all(touches) if self.always else any(touches):
             return Verdict(True)
         text = self.otherwise or f"{_spoken(self.first)} doesn't touch {_spoken(self.second)}"
-        return Verdict(False, text + self._always())
+        return Verdict(False, text + (self._always() if self.always else self._during()))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -285,15 +289,51 @@ class HeldStill(MeasuredPredicate):
         _require_window(self)
 
     def _values(self, scene: Scene, window: Sequence[Snapshot]) -> np.ndarray:
-        p_WC = _positions(window, self.object, _point(scene, self.object, ""))
-        p_EC = np.array([s.X_WE.inverse().multiply(p) for s, p in zip(window, p_WC, strict=True)])
-        return np.linalg.norm(p_EC - p_EC[0], axis=1)
+        return _slips(scene, window, self.object)
 
     def _limit(self) -> float:
         return self.slip
 
     def _text(self) -> str:
         return f"{self.object} slipped in the hand{self._during()}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarriedStill(MeasuredPredicate):
+    """An object that is in the hand at the start moved in the end effector frame E by at most
+    `slip` (m), its centre of mass, for as long as nothing but the robot touched it."""
+
+    quantity = "carrying_slip"
+    object: str
+    slip: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.for_last > 0:
+            raise TaskError(
+                f"CarriedStill.for_last: {self.for_last} s found, none expected: it judges the way "
+                "from the start to the first touch"
+            )
+
+    def judge(self, scene: Scene, snapshots: Sequence[Snapshot]) -> Verdict:
+        if not snapshots:
+            raise TaskError("CarriedStill: there are no snapshots: record the episode")
+        _require_bodies(snapshots[0], self.object)
+        held = frozenset((self.object, ROBOT))
+        alone = [
+            all(self.object not in pair or pair == held for pair in s.contacts) for s in snapshots
+        ]
+        count = alone.index(False) if False in alone else len(snapshots)
+        return self._judge_window(scene, snapshots[: max(count, 1)])
+
+    def _values(self, scene: Scene, window: Sequence[Snapshot]) -> np.ndarray:
+        return _slips(scene, window, self.object)
+
+    def _limit(self) -> float:
+        return self.slip
+
+    def _text(self) -> str:
+        return f"{self.object} slipped in the hand on the way"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -473,6 +513,13 @@ def _pose(snapshot: Snapshot, name: str) -> RigidTransform:
 def _positions(window: Sequence[Snapshot], name: str, p_OP: np.ndarray) -> np.ndarray:
     """(n, 3) p_WP (m) of a point of an object at each of n snapshots."""
     return np.array([_pose(snapshot, name).multiply(p_OP) for snapshot in window])
+
+
+def _slips(scene: Scene, window: Sequence[Snapshot], name: str) -> np.ndarray:
+    """(n,) distances (m) that an object's centre of mass has moved in E since the window began."""
+    p_WC = _positions(window, name, _point(scene, name, ""))
+    p_EC = np.array([s.X_WE.inverse().multiply(p) for s, p in zip(window, p_WC, strict=True)])
+    return np.linalg.norm(p_EC - p_EC[0], axis=1)
 
 
 def _axes(window: Sequence[Snapshot], name: str) -> np.ndarray:

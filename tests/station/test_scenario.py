@@ -17,7 +17,7 @@ from iga_drake.station.scenario import (
     load_scenario,
 )
 
-SHIPPED = ("grasp", "stack", "field", "one_of_everything")
+SHIPPED = ("grasp", "stack", "hang", "insert", "field", "one_of_everything")
 
 
 def _load(tmp_path, text: str) -> Scenario:

@@ -14,6 +14,7 @@ from iga_drake.tasks.predicates import (
     AllOf,
     AtRest,
     Below,
+    CarriedStill,
     CountOf,
     HeldStill,
     Inside,
@@ -111,6 +112,9 @@ def test_touching_is_for_the_whole_window_or_the_end(pair: tuple[str, str]) -> N
             assert not _holds(touching, never) and _holds(free, never)
             assert _holds(touching, late) == (for_last < 2.0) and not _holds(free, late)
     released = _snapshots(contacts=lambda t: {pair} if t < 1.5 else set())
+    once = Touching(first=first, second=second, for_last=1.0, always=False)
+    assert not _holds(once, released) and not _holds(once, never)
+    assert _holds(once, _snapshots(contacts=lambda t: {pair} if 2.2 < t < 2.4 else set()))
     assert _holds(NotTouching(first=first, second=second, for_last=1.0), released)
     assert not _holds(NotTouching(first=first, second=second, for_last=2.0), released)
 
@@ -184,6 +188,28 @@ def test_slip_is_in_the_hand_whatever_the_hand_does() -> None:
     assert _judged(still, turning, "slip") == pytest.approx(0.0, abs=1e-12)
     with pytest.raises(TaskError, match=r"for_last: 0\.0 s found"):
         HeldStill(object="box", slip=0.01)
+
+
+def test_carrying_ends_where_something_else_is_touched() -> None:
+    def slipping(first_touch: float, what: tuple[str, str] = ("box", "marble")) -> list[Snapshot]:
+        hand = ("box", ROBOT)
+        return _snapshots(
+            contacts=lambda t: {hand} if t < first_touch - 1e-9 else {hand, what},
+            box=lambda t: _pose([0, 0, 0.01 * t]) @ START["box"],
+        )
+
+    still = CarriedStill(object="box", slip=0.015)
+    assert _judged(still, slipping(1.0), "carrying_slip") == pytest.approx(0.0095)
+    assert _judged(still, slipping(9.0), "carrying_slip") == pytest.approx(0.03)
+    assert _judged(still, slipping(0.0), "carrying_slip") == 0.0
+    assert _holds(still, slipping(1.0)) and not _holds(still, slipping(2.0))
+    # What the marble touches is not the box' business; the table is.
+    assert not _holds(still, slipping(1.0, ("marble", TABLE)))
+    assert _holds(still, slipping(1.0, ("box", TABLE)))
+    with pytest.raises(TaskError, match="for_last"):
+        CarriedStill(object="box", slip=0.01, for_last=1.0)
+    with pytest.raises(TaskError, match="no snapshots"):
+        still.judge(SCENE, [])
 
 
 @pytest.mark.parametrize("seed", range(5))

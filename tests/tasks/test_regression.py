@@ -9,7 +9,12 @@ import pytest
 from iga_drake.testing import assert_success
 
 # task -> seeds, and how many of them have to succeed.
-CASES = {"grasp": ((3, 4, 5, 6), 3), "stack": ((3, 4, 5, 6), 3)}
+CASES = {
+    "grasp": ((3, 4, 5, 6), 3),
+    "stack": ((3, 4, 5, 6), 3),
+    "hang": ((3,), 1),
+    "insert": ((3,), 1),
+}
 
 
 @pytest.mark.parametrize("task", CASES)

@@ -26,7 +26,8 @@ def test_splits_are_disjoint_and_fixed(task: Task) -> None:
     everything = shapes["demonstration"] + shapes["test"]
     for i, one in enumerate(everything):
         for other in everything[:i]:
-            assert np.abs(one.vertices - other.vertices).max() > 1e-3
+            if one.family == other.family:
+                assert np.abs(one.vertices - other.vertices).max() > 1e-3
     assert task.instances("test")[0] is make_task(task.name).instances("test")[0]
 
 
@@ -70,9 +71,9 @@ def test_yaws_go_all_the_way_round(task: Task, tmp_path: Path) -> None:
 
 
 def test_unknown_names_are_refused_with_the_known_ones(task: Task) -> None:
-    with pytest.raises(TaskError, match="grasp, stack"):
+    with pytest.raises(TaskError, match="grasp, hang, insert"):
         make_task("juggle")
     with pytest.raises(TaskError, match="demonstration, test"):
         task.scene(0, "training")
-    with pytest.raises(TaskError, match="there are 8"):
+    with pytest.raises(TaskError, match=f"there are {len(task.instances('test'))}"):
         task.scene(0, instance=99)

@@ -1,7 +1,8 @@
 """Stands that hold other objects: hook stand, dish rack and coat hanger. They stand on z = 0.
 
 Frames: `base` on the ground; `hook_upper`, `hook_lower`, `hook` and `peg` at the tip of a hook or
-peg, x along it outwards; `opening` in the mouth of a rack's holder, z out of it; `bar` in the
+peg, x along it outwards; `hook_seat` on top of the upper hook where it is lowest, x level and
+outwards; `opening` in the mouth of a rack's holder, z out of it; `bar` in the
 middle of a hanger's bar; `shoulder` at the end of a hanger's arm, x outwards.
 """
 
@@ -32,6 +33,13 @@ def _hook_stand(p: Parameters) -> Draft:
     scale = np.array([0.97, 1.0, 1.0, 0.5 * (1 + p["foot_dome"]), p["foot_dome"]])
     section = superellipse(32, p["foot_exponent"])
     base = loft(rings(section, 0.5 * foot * scale, 0.5 * foot * p["foot_ratio"] * scale, z))
+
+    def foot_pieces() -> list[np.ndarray]:
+        # Quarters, each of which touches the ground at a place of its own.
+        levels, ends = base.vertices[1:-1].reshape(len(z), -1, 3), base.vertices[[0, -1]]
+        quarters = [np.arange(k, k + 9) % 32 for k in (0, 8, 16, 24)]
+        return [np.concatenate([levels[:, q].reshape(-1, 3), ends]) for q in quarters]
+
     pole = p["pole"]
     swell = spline([1.0 + p["pole_root"], 1.0, 1.0, p["pole_top"]], 14)
     stem = tubes(
@@ -60,10 +68,11 @@ def _hook_stand(p: Parameters) -> Draft:
         ]
     )
     lines = spline(control, 12).transpose(1, 0, 2)
+    thickness = p["hook"] * np.linspace(1.15, 0.85, 12)
     hooks = tubes(
         lines,
-        width=p["hook"] * np.linspace(1.15, 0.85, 12),
-        height=p["hook"] * np.linspace(1.15, 0.85, 12),
+        width=thickness,
+        height=thickness,
         up=np.stack([-out[:, 1], out[:, 0], 0 * angle], axis=1)[:, None],
         segments=10,
         caps=(0.001, 0.5 * p["hook"]),
@@ -76,13 +85,21 @@ def _hook_stand(p: Parameters) -> Draft:
         )
         for k in (0, 2)
     ]
+    # Beyond the stem, which the hook begins in.
+    lowest = 3 + int(lines[0, 3:, 2].argmin())
+    seat = lines[0, lowest] + [0.0, 0.0, 0.5 * thickness[lowest]]
     return Draft(
         (
-            Part("foot", base, lambda: [base.vertices]),
+            Part("foot", base, foot_pieces),
             Part("stem", stem, hulls(stem, segments=14, lengths=3)),
             Part("hooks", hooks, hulls(hooks, 4, segments=10, lengths=4)),
         ),
-        {"base": frame((0.0, 0.0, 0.0)), "hook_upper": tips[0], "hook_lower": tips[1]},
+        {
+            "base": frame((0.0, 0.0, 0.0)),
+            "hook_upper": tips[0],
+            "hook_lower": tips[1],
+            "hook_seat": frame(seat),
+        },
     )
 
 

@@ -126,7 +126,16 @@ def solid(
     def pieces() -> list[np.ndarray]:
         rings = surface.vertices[1:-1].reshape(-1, segments, 3)
         cuts = surfaces.chord_cuts(rings[:, [0, segments // 8]].swapaxes(0, 1), 0.002)
-        return surfaces.tube_pieces(surface, segments=segments, cuts=cuts)
+        lowest, *above = surfaces.tube_pieces(surface, segments=segments, cuts=cuts)
+        # Quarters below, each of which touches what it stands on at a place of its own.
+        levels = lowest[: (cuts[1] + 1) * segments].reshape(-1, segments, 3)
+        axis = levels.mean(axis=1)
+        quarters = [
+            np.arange(start, start + segments // 4 + 1) % segments
+            for start in range(0, segments, segments // 4)
+        ]
+        low = [np.concatenate([levels[:, q].reshape(-1, 3), axis]) for q in quarters]
+        return [*low, *above]
 
     return Part(names[0], surface, pieces, (names, labels))
 

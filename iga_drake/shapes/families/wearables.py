@@ -1,9 +1,9 @@
 """Wearables: shoe, boot, cap and hat. They stand on z = 0, the front towards +x.
 
 Frames: `sole` under the middle of a sole, z up; `opening` in the middle of a shoe's or boot's
-opening, z out of it; `toe` and `heel` at the ends of a sole, x outwards; `head_opening` in the
-opening of a cap or hat, z down out of it; `crown` on top of it, z up; `brim` at the front of the
-brim, x outwards.
+opening, z out of it; `insole` on the inner sole below that, z up; `toe` and `heel` at the ends of a
+sole, x outwards; `head_opening` in the opening of a cap or hat, z down out of it; `crown` on top of
+it, z up; `brim` at the front of the brim, x outwards.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,6 @@ from iga_drake.shapes.families.blocks import (
     hulls,
     rings,
     sheet,
-    sheet_pieces,
     shell,
     shell_bands,
     spline,
@@ -89,6 +88,14 @@ def _footwear(p: Parameters) -> Draft:
     both = spline(np.concatenate([control(0.0, -0.002), control(wall, 0.004)], axis=1), _ROWS)
     upper = shell(both[:, :_ROUND], both[:, _ROUND:])
     top = both[-1, :_ROUND].mean(axis=0)
+    # The inner sole is a fan from its edge to the edge's middle.
+    edge = both[0, _ROUND:]
+    middle_sole = edge.mean(axis=0)
+    away, spokes = (top - middle_sole)[:2], (edge - middle_sole)[:, :2]
+    lengths = np.linalg.norm(spokes, axis=1)
+    spoke = int((spokes @ away / lengths).argmax())
+    share = float(np.linalg.norm(away) / lengths[spoke])
+    insole = [*top[:2], (1 - share) * middle_sole[2] + share * edge[spoke, 2]]
     return stand(
         Draft(
             (
@@ -103,6 +110,7 @@ def _footwear(p: Parameters) -> Draft:
             {
                 "sole": frame((0.0, 0.0, 0.0)),
                 "opening": frame(top, x=both[-1, 0] - both[-1, _ROUND // 2]),
+                "insole": frame(np.array(insole)),
                 "toe": frame(0.5 * (sole_rings[1, 0] + sole_rings[2, 0])),
                 "heel": frame(
                     0.5 * (sole_rings[1, _ROUND // 2] + sole_rings[2, _ROUND // 2]),
@@ -114,7 +122,8 @@ def _footwear(p: Parameters) -> Draft:
 
 
 def _sole_pieces(vertices: np.ndarray, t: np.ndarray) -> Callable[[], list[np.ndarray]]:
-    """Convex pieces of a sole by lengths along it."""
+    """Convex pieces of a sole by lengths along it, the left and the right apart: each touches the
+    ground at a place of its own, so that a shoe stands firm."""
 
     def pieces() -> list[np.ndarray]:
         levels = vertices[1:-1].reshape(-1, len(t), 3)
@@ -124,7 +133,9 @@ def _sole_pieces(vertices: np.ndarray, t: np.ndarray) -> Callable[[], list[np.nd
             # From heel to toe one index on either side: `t` falls from 1 to 0 over the first half.
             near = [int(np.abs(t[: half + 1] - v).argmin()) for v in (a, b)]
             side = np.arange(near[1], near[0] + 1)
-            found.append(levels[:, np.concatenate([side, -side])].reshape(-1, 3))
+            middle = 0.5 * (levels[:, side] + levels[:, -side])
+            for edge in (side, -side):
+                found.append(np.concatenate([levels[:, edge], middle]).reshape(-1, 3))
         return found
 
     return pieces
@@ -180,6 +191,13 @@ def _cap(p: Parameters) -> Draft:
     droop = (p["peak_drop"] + p["peak_curl"] * side) * p["peak_reach"]
     grid[..., 2] = 0.5 * p["peak_thickness"] + 0.002 - droop * s
     peak = sheet(grid, p["peak_thickness"])
+
+    def peak_pieces() -> list[np.ndarray]:
+        # Straight outwards and nearly flat: corners say it all, and contact is quick with few
+        # faces. An odd number, so that a hand may hold the one in the middle.
+        corners = peak.vertices.reshape(2, out, across, 3)[:, [0, -1], ::4]
+        return [corners[:, :, k : k + 2].reshape(-1, 3) for k in range(5)]
+
     return stand(
         Draft(
             (
@@ -189,7 +207,7 @@ def _cap(p: Parameters) -> Draft:
                     wall_hulls(crown, rows, sectors=12, cuts=(0, 3, 6, 9, 13), domed=True),
                 ),
                 Part("button", button, hulls(button)),
-                Part("peak", peak, sheet_pieces(peak, (out, across), cuts=(1, 6))),
+                Part("peak", peak, peak_pieces),
             ),
             {
                 "head_opening": frame((0.0, 0.0, 0.0), z=(0.0, 0.0, -1.0)),

@@ -55,6 +55,9 @@ TOPS = [
     ("box", "floor", 2),
     ("tray", "floor", 2),
     ("hat", "crown", 2),
+    ("hook_stand", "hook_seat", 2),
+    ("shoe", "insole", 2),
+    ("boot", "insole", 2),
     ("guitar", "body", 0),
     ("guitar", "bridge", 0),
 ]
