@@ -2,21 +2,19 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import MultibodyPlant
-from scipy.optimize import linprog
 
 from iga_drake.policy.motion import ObservationPlan, TaskMotion, WaypointMotion
 from iga_drake.shapes.families import bowl
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
-from iga_drake.station.panda.model import HOME_POSITION, add_panda
+from iga_drake.station.panda.model import HOME_POSITION
 from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
+from iga_drake.tasks.holding import extent_between_pads, hand_pose
 from iga_drake.tasks.nesting import nesting_height, release_height
 from iga_drake.tasks.placement import WorkArea
 from iga_drake.tasks.predicates import (
@@ -29,7 +27,7 @@ from iga_drake.tasks.predicates import (
     Touching,
     Upright,
 )
-from iga_drake.tasks.snapshots import ROBOT, TABLE, TaskError
+from iga_drake.tasks.snapshots import ROBOT, TABLE
 from iga_drake.tasks.task import Split, Task
 
 TARGET, HELD = "target", "grasped"
@@ -47,7 +45,6 @@ RELEASE_OPENING = (
 _WORK_AREA = WorkArea(lower=(0.42, -0.25), upper=(0.65, 0.25), reach=(0.48, 0.68))
 _GRIP_DEPTH = (0.004, 0.007)  # m from the rim to the middle of the pads
 _GRIP_ROLL = 0.1  # rad about the fingers' direction
-_PAD = 0.009  # m, half edge of a pad
 _COLORS = ((0.85, 0.83, 0.76), (0.2, 0.42, 0.6), (0.72, 0.35, 0.24), (0.35, 0.55, 0.4))
 
 
@@ -65,33 +62,9 @@ def grip(shape: ShapeInstance, *, depth: float, roll: float) -> tuple[RigidTrans
         @ RigidTransform(R_RE, [0.0, 0.0, -depth])
         @ RigidTransform(RotationMatrix.MakeYRotation(roll), [0, 0, 0])
     )
-    low, high = _extent_between_pads(shape, X_OE)
-    return X_OE @ RigidTransform([0.0, (low + high) / 2, 0.0]), high - low
-
-
-def _extent_between_pads(shape: ShapeInstance, X_OE: RigidTransform) -> tuple[float, float]:
-    """Range of y_E (m) that the collision pieces take up between the pads."""
-    X_EO = X_OE.inverse()
-    values = []
-    for piece in shape.convex_pieces:
-        p = X_EO.multiply(piece.T)  # (3, n)
-        if (p[[0, 2]].min(axis=1) > _PAD).any() or (p[[0, 2]].max(axis=1) < -_PAD).any():
-            continue
-        # Least and greatest y of convex combinations of the corners within the pads' square.
-        between = {
-            "A_ub": np.vstack([p[[0, 2]], -p[[0, 2]]]),
-            "b_ub": np.full(4, _PAD),
-            "A_eq": np.ones((1, p.shape[1])),
-            "b_eq": [1.0],
-        }
-        for sign in (1.0, -1.0):
-            least = linprog(sign * p[1], **between)
-            values += [sign * least.fun] if least.success else []
     # The opposite wall is far away.
-    values = [value for value in values if abs(value) < 0.02]
-    if not values:
-        raise TaskError("grip: the pads don't reach the bowl's rim")
-    return min(values), max(values)
+    low, high = extent_between_pads(shape, X_OE, beyond=0.02)
+    return X_OE @ RigidTransform([0.0, (low + high) / 2, 0.0]), high - low
 
 
 def _pair(seed: int) -> Mapping[str, ShapeInstance]:
@@ -112,17 +85,6 @@ def _pair(seed: int) -> Mapping[str, ShapeInstance]:
         sunk = 1.0 - nested / bowl.profile(target).profile[:, 1].max()
         if release - nested <= MAXIMUM_DROP and sunk > DEPTH_SHARE + 0.2:
             return shapes
-
-
-@cache
-def _start_pose() -> RigidTransform:
-    """X_WE at `Stack.observe_posture`."""
-    plant = MultibodyPlant(0.0)
-    panda = add_panda(plant, visuals="none")
-    plant.Finalize()
-    context = plant.CreateDefaultContext()
-    panda.set_position(context, Stack.observe_posture)
-    return panda.X_WE(context)
 
 
 class Stack(Task):
@@ -182,7 +144,7 @@ class Stack(Task):
 
         objects = (
             SceneObject(TARGET, "target", sdf(TARGET, 0), _WORK_AREA.draw_pose(rng)),
-            SceneObject(HELD, "grasped", sdf(HELD, 1), _start_pose() @ X_EO),
+            SceneObject(HELD, "grasped", sdf(HELD, 1), hand_pose(self.observe_posture) @ X_EO),
         )
         return Scene(
             objects=objects,
