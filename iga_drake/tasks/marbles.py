@@ -9,8 +9,8 @@ from iga_drake.station.simulated.scene import SceneObject
 
 FRICTION = 0.2
 _DENSITY = 2500.0  # kg/m^3, glass
-# Pa: under its weight a marble gives way by less than 0.1 mm. A contact surface with convex pieces
-# is exact where a single contact point has a wrong normal, at the edge of a thin floor.
+# Pa. A contact surface with convex pieces is exact where a single contact point has a wrong normal,
+# at the edge of a thin floor.
 _MODULUS = 1e7
 
 

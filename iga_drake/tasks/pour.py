@@ -52,7 +52,7 @@ _COLORS = ((0.85, 0.83, 0.76), (0.2, 0.42, 0.6), (0.72, 0.35, 0.24), (0.35, 0.55
 _MARBLE_COLOR = (0.15, 0.2, 0.25)
 
 
-def grip(shape: ShapeInstance, *, along: float, roll: float) -> tuple[RigidTransform, float]:
+def vessel_grip(shape: ShapeInstance, *, along: float, roll: float) -> tuple[RigidTransform, float]:
     """X_OE of a hand that holds a vessel by its handle from behind, and the pads' distance (m).
 
     The hand is level and points at the vessel's axis. `along` (m) upwards from the handle's middle,
@@ -84,20 +84,14 @@ def poured_poses(vessel: ShapeInstance, mug: ShapeInstance) -> tuple[RigidTransf
     return tuple(poses)
 
 
-def _part(shape: ShapeInstance, *names: str) -> np.ndarray:
-    """(n, 3) vertices of parts (m)."""
-    chosen = [shape.part_names.index(name) for name in names]
-    return shape.vertices[np.unique(shape.faces[np.isin(shape.part_labels, chosen)])]
-
-
 def _pours(vessel: ShapeInstance) -> bool:
     """Whether the hand gets around the handle, and a marble out over the spout."""
     handle = vessel.frames["handle"][:3, 3]
-    wall = _part(vessel, "wall_outside")
+    wall = vessel.part_vertices("wall_outside")
     near = wall[np.abs(wall[:, 2] - handle[2]) < 0.03]
     if handle[0] - near[:, 0].max() < _FINGER_ROOM:
         return False
-    inside = _part(vessel, "wall_inside")
+    inside = vessel.part_vertices("wall_inside")
     line = inside[(np.abs(inside[:, 1]) < 1e-4) & (inside[:, 0] < 0)]
     line = line[np.argsort(line[:, 2])]
     narrowing = np.diff(line[:, 0]) / np.diff(line[:, 2])
@@ -184,7 +178,7 @@ class Pour(Task):
 
     def arrange(self, truth: SceneTruth, rng: np.random.Generator, mesh_folder: Path) -> Scene:
         shapes = truth.shapes
-        X_OE, opening = grip(
+        X_OE, opening = vessel_grip(
             shapes[HELD],
             along=rng.uniform(-_GRIP_ALONG, _GRIP_ALONG),
             roll=rng.uniform(-_GRIP_ROLL, _GRIP_ROLL),
@@ -201,7 +195,7 @@ class Pour(Task):
             return write_sdf(shapes[name], mesh_folder, name=name, color=rgb, friction=0.7)
 
         X_WH = hand_pose(self.observe_posture) @ X_EO
-        floor = _part(shapes[HELD], "floor")[:, 2].max()
+        floor = shapes[HELD].part_vertices("floor")[:, 2].max()
         radius = shapes[MARBLE].parameters["diameter"] / 2
         X_WM = RigidTransform(X_WH.multiply(np.array([0.0, 0.0, floor + radius + 0.001])))
         return Scene(

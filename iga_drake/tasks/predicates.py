@@ -403,10 +403,9 @@ class Inside(MeasuredPredicate):
                 f"Inside.parts: {', '.join(unknown)} found, {self.other} has "
                 f"{', '.join(shape.part_names)}"
             )
-        chosen = [shape.part_names.index(name) for name in self.parts or shape.part_names]
-        corners = np.unique(shape.faces[np.isin(shape.part_labels, chosen)])
+        corners = shape.part_vertices(*(self.parts or shape.part_names))
         try:
-            planes = ConvexHull(shape.vertices[corners]).equations  # (f, 4): outward normal, offset
+            planes = ConvexHull(corners).equations  # (f, 4): outward normal, offset
         except QhullError as error:
             raise TaskError(
                 f"Inside.parts: {', '.join(self.parts)} of {self.other} is flat: name a part more"

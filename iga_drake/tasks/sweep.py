@@ -56,7 +56,7 @@ _COLORS = ((0.2, 0.42, 0.6), (0.72, 0.35, 0.24), (0.35, 0.55, 0.4), (0.5, 0.5, 0
 _MARBLE_COLOR = (0.85, 0.75, 0.2)
 
 
-def grip(shape: ShapeInstance, *, along: float, roll: float) -> tuple[RigidTransform, float]:
+def brush_grip(shape: ShapeInstance, *, along: float, roll: float) -> tuple[RigidTransform, float]:
     """X_OE of a hand that holds a brush by its handle from above, and the pads' distance (m).
 
     The brush points along the hand's +x. The hand is near the brush's head, whose weight turns the
@@ -64,7 +64,7 @@ def grip(shape: ShapeInstance, *, along: float, roll: float) -> tuple[RigidTrans
     """
     p = shape.parameters
     x = 0.5 * p["length"] - 0.012 + _GRIP_SHARE * p["handle_length"] + along
-    handle = _part(shape, "handle")
+    handle = shape.part_vertices("handle")
     around = handle[np.abs(handle[:, 0] - x) < 0.008, 2]
     down = RotationMatrix.MakeYRotation(np.pi) @ RotationMatrix.MakeYRotation(roll)
     X_OE = RigidTransform(down, [x, 0.0, (around.min() + around.max()) / 2])
@@ -75,10 +75,10 @@ def grip(shape: ShapeInstance, *, along: float, roll: float) -> tuple[RigidTrans
 def swept_poses(brush: ShapeInstance, pan: ShapeInstance) -> tuple[RigidTransform, ...]:
     """X_TH of the brush in the dustpan's frame at each waypoint: level, its bristles' front across
     the way into the dustpan, as low as they may be."""
-    bristles = _part(brush, "bristles")
+    bristles = brush.part_vertices("bristles")
     low = bristles[bristles[:, 2] < 0.015]
     edge = pan.frames["edge"][:3, 3]
-    scoop = _part(pan, "scoop")
+    scoop = pan.part_vertices("scoop")
     ahead = scoop[np.abs(scoop[:, 1]) < np.abs(bristles[:, 0]).max()]
     poses = []
     for front in FRONTS:
@@ -90,16 +90,10 @@ def swept_poses(brush: ShapeInstance, pan: ShapeInstance) -> tuple[RigidTransfor
     return tuple(poses)
 
 
-def _part(shape: ShapeInstance, name: str) -> np.ndarray:
-    """(n, 3) vertices of a part (m)."""
-    faces = shape.faces[shape.part_labels == shape.part_names.index(name)]
-    return shape.vertices[np.unique(faces)]
-
-
 def _is_free(brush: ShapeInstance, pan: ShapeInstance) -> bool:
     """Whether brush and hand keep `_HAND_GAP` from the dustpan at the last waypoint, but for the
     bristles' lower end."""
-    X_OE, opening = grip(brush, along=0.0, roll=0.0)
+    X_OE, opening = brush_grip(brush, along=0.0, roll=0.0)
     hand = X_OE.multiply(gripper_cloud(opening, spacing=0.004).T).T
     tall = brush.vertices[brush.vertices[:, 2] > 0.01]
     # On the brush's way into the dustpan, too.
@@ -193,7 +187,7 @@ class Sweep(Task):
 
     def arrange(self, truth: SceneTruth, rng: np.random.Generator, mesh_folder: Path) -> Scene:
         shapes = truth.shapes
-        X_OE, opening = grip(
+        X_OE, opening = brush_grip(
             shapes[HELD],
             along=rng.uniform(-_GRIP_ALONG, _GRIP_ALONG),
             roll=rng.uniform(-_GRIP_ROLL, _GRIP_ROLL),
@@ -225,7 +219,9 @@ class Sweep(Task):
             ]
             p_TM[2] = radius
             objects.append(
-                marble_object(name, shapes[name], _MARBLE_COLOR, RigidTransform(X_WT.multiply(p_TM)))
+                marble_object(
+                    name, shapes[name], _MARBLE_COLOR, RigidTransform(X_WT.multiply(p_TM))
+                )
             )
         return Scene(
             objects=tuple(objects),
@@ -272,10 +268,12 @@ class Sweep(Task):
 def _can_serve(X_WE: RigidTransform) -> bool:
     """Whether the hand can be at a pose of the sweep."""
     x, y, _ = X_WE.translation()
-    sweep = X_WE.rotation().matrix()[:, 1]  # see `swept_poses` and `grip`
+    sweep = X_WE.rotation().matrix()[:, 1]  # see `swept_poses` and `brush_grip`
     turn = np.arctan2(sweep[1], sweep[0]) - np.arctan2(y, x) - _HAND_YAW_MIDDLE
     turned = abs((turn + np.pi) % (2 * np.pi) - np.pi)
-    return bool(_HAND_REACH[0] <= np.hypot(x, y) <= _HAND_REACH[1] and x > 0.1 and turned < _HAND_YAW)
+    return bool(
+        _HAND_REACH[0] <= np.hypot(x, y) <= _HAND_REACH[1] and x > 0.1 and turned < _HAND_YAW
+    )
 
 
 TASKS = {Sweep.name: Sweep}

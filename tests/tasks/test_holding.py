@@ -1,6 +1,5 @@
 """What is between the pads of a hand."""
 
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix

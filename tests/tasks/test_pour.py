@@ -51,7 +51,9 @@ def _trajectory(
 
 
 def test_a_marble_that_rests_in_the_mug_is_a_success(scene: Scene) -> None:
-    flying = _trajectory(scene, p_TM=lambda t: [0, 0, 0.02] if t > 1.9 else [0.1 - 0.05 * t, 0, 0.3])
+    flying = _trajectory(
+        scene, p_TM=lambda t: [0, 0, 0.02] if t > 1.9 else [0.1 - 0.05 * t, 0, 0.3]
+    )
     verdict = Pour().success(scene, flying)
     assert verdict.success and verdict.reason == ""
     assert verdict.measures["margin_inside"] > 0.005
@@ -95,7 +97,7 @@ def test_the_expert_brings_the_spout_over_the_opening_and_tips_it(
         assert over[0][0] < -radius - 0.02 and over[0][2] > 0.05
         for p in over[1:]:
             assert np.hypot(p[0], p[1]) < 0.6 * radius and 0.01 < p[2] < 0.04
-        # The tipped spout is the vessel's lowest place, near the mug; the vessel stays off the table.
+        # The vessel stays off the table; tipped, its spout is its lowest place.
         lowest = [X.multiply(vessel.vertices.T)[2].min() for X in poses]
         assert min(lowest) > 0.02
         assert lowest[2] > (poses[2] @ spout(vessel))[2] - 0.004

@@ -86,9 +86,7 @@ def test_the_expert_s_bristles_pass_over_the_marbles_into_the_dustpan(
         X_EO = scene.truth.X_EO[HELD]
         poses = task.expert(scene, X_WO, X_WO[HELD] @ X_EO.inverse())
         edge = pan.frames["edge"][0, 3]
-        bristles = brush.vertices[
-            np.unique(brush.faces[brush.part_labels == brush.part_names.index("bristles")])
-        ]
+        bristles = brush.part_vertices("bristles")
         low = bristles[bristles[:, 2] < 0.012]
         fronts = []
         for X_WE in poses:
