@@ -123,7 +123,9 @@ def _pair(seed: int) -> dict[str, ShapeInstance]:
         brush = FAMILIES["brush"].build(held).with_mass(rng.uniform(0.04, 0.08))
         pan = FAMILIES["dustpan"].build(target).with_mass(rng.uniform(0.15, 0.35))
         stands = pan.mass_properties.p_OCcm[0] < 0.2 * target["length"] - 0.012
-        if stands and _is_free(brush, pan):
+        # The brush has room between the walls.
+        fits = swept_poses(brush, pan)[-1].translation()[2] < 0.01
+        if stands and fits and _is_free(brush, pan):
             return {TARGET: pan, HELD: brush}
 
 

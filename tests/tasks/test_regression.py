@@ -25,7 +25,7 @@ def test_learned_aligner_does_the_task(task: str):
     assert sum(result.success for result in results) >= needed, "\n" + format_table(results)
 
 
-@pytest.mark.parametrize("task", CASES)
+@pytest.mark.parametrize("task", [*CASES, "pour", "sweep"])
 def test_expert_does_the_task(task: str):
     """What fails here is not perception: the motion, the contact or the verdict."""
     (result,) = evaluate(

@@ -87,7 +87,7 @@ def test_the_expert_s_bristles_pass_over_the_marbles_into_the_dustpan(
         poses = task.expert(scene, X_WO, X_WO[HELD] @ X_EO.inverse())
         edge = pan.frames["edge"][0, 3]
         bristles = brush.part_vertices("bristles")
-        low = bristles[bristles[:, 2] < 0.012]
+        low = bristles[bristles[:, 2] < 0.015]
         fronts = []
         for X_WE in poses:
             X_TH = X_WO[TARGET].inverse() @ X_WE @ X_EO
