@@ -122,6 +122,7 @@ class WaypointMotion:
     grasped: str
     target: str
     # Offset (m) of the pose before the waypoint: along the axes of E there, plus along those of W.
+    # All zero: the way goes to the waypoint at once.
     before_E: tuple[float, float, float] = (0.0, 0.0, 0.0)
     before_W: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # Opening (m) commanded on the way, and at the waypoint where no demonstration says it.
@@ -132,7 +133,7 @@ class WaypointMotion:
     # Change of the external force on the hand (N) at which the way from before the waypoint to it
     # ends early: the hand acts where it is then. None: it ends at the waypoint alone.
     contact_force: float | None = None
-    # Offset (m) of the pose after the waypoint.
+    # Offset (m) of the pose after the waypoint. All zero: the hand stays there.
     after_E: tuple[float, float, float] = (0.0, 0.0, 0.0)
     after_W: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # Speed around the waypoint, as a share of the follower's.
@@ -209,8 +210,9 @@ def motion_steps(
     opening_reached: float,
     nominal_posture: np.ndarray | None = None,
 ) -> tuple[MotionStep, ...]:
-    """The four targets around one inferred waypoint `X_WE`: before it, at it, the hand's action
-    there, and after it. Their sequence numbers rise from `first_sequence`."""
+    """The targets around one inferred waypoint `X_WE`: before it, at it, the hand's action there,
+    and after it; without those whose offsets are zero. Their sequence numbers rise from
+    `first_sequence`."""
     before = offset_pose(X_WE, motion.before_E, motion.before_W)
     after = offset_pose(X_WE, motion.after_E, motion.after_W)
     approach = motion.opening_approach
@@ -221,6 +223,9 @@ def motion_steps(
         ("hand at", X_WE, opening_reached, opening_reached, motion.settle, 1.0),
         ("after", after, opening_reached, opening_reached, 0.2, motion.speed_scale),
     ]
+    unmoved = {"before": not any(motion.before_E + motion.before_W)}
+    unmoved["after"] = not any(motion.after_E + motion.after_W)
+    plan = [row for row in plan if not unmoved.get(row[0], False)]
     return tuple(
         MotionStep(
             name=f"{name} {motion.name}",

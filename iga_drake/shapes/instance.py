@@ -120,6 +120,13 @@ class ShapeInstance:
             I_CcmO=np.asarray(properties.inertia, dtype=np.float64) * self.density,
         )
 
+    def part_vertices(self, *names: str) -> np.ndarray:
+        """(n, 3) the vertices (m) of these parts. Raises `ShapeError` where one isn't there."""
+        unknown = sorted(set(names) - set(self.part_names))
+        self._require(not unknown, f"no part {', '.join(unknown)}: {', '.join(self.part_names)}")
+        chosen = [self.part_names.index(name) for name in names]
+        return self.vertices[np.unique(self.faces[np.isin(self.part_labels, chosen)])]
+
     def check_closed(self) -> None:
         """Raises `ShapeError` unless the faces close the solid and all look outwards."""
         self._require(self.mesh.is_watertight, "the mesh is not watertight")

@@ -5,6 +5,7 @@ last `for_last` seconds, or the last snapshot alone where that is 0, and says in
 not hold.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -101,7 +102,8 @@ class CountOf(Predicate):
 class WindowPredicate(Predicate):
     """A predicate about the end of an episode."""
 
-    # How long it has to hold (s), up to the last snapshot; 0: at the last snapshot alone.
+    # How long it has to hold (s), up to the last snapshot; 0: at the last snapshot alone; infinite:
+    # from the first snapshot on.
     for_last: float = 0.0
     # Prefix of the measure's name, for compositions in which two predicates measure the same.
     name: str = ""
@@ -119,7 +121,9 @@ class WindowPredicate(Predicate):
         if not snapshots:
             raise TaskError(f"{type(self).__name__}: there are no snapshots: record the episode")
         window: Sequence[Snapshot] = snapshots[-1:]
-        if self.for_last > 0:
+        if math.isinf(self.for_last):
+            window = snapshots
+        elif self.for_last > 0:
             window = last_seconds(scene.truth.task, snapshots, self.for_last)
         return self._judge_window(scene, window)
 
@@ -128,10 +132,15 @@ class WindowPredicate(Predicate):
         """The verdict on the snapshots of the window, of which there is at least one."""
 
     def _during(self) -> str:
-        return f" within the last {self.for_last:g} s" if self.for_last > 0 else ""
+        return self._span("within the last {:g} s", "since the start")
 
     def _always(self) -> str:
-        return f" for all of the last {self.for_last:g} s" if self.for_last > 0 else ""
+        return self._span("for all of the last {:g} s", "for all of the time")
+
+    def _span(self, seconds: str, whole: str) -> str:
+        if not self.for_last > 0:
+            return ""
+        return " " + (whole if math.isinf(self.for_last) else seconds.format(self.for_last))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -434,10 +443,9 @@ class Inside(MeasuredPredicate):
                 f"Inside.parts: {', '.join(unknown)} found, {self.other} has "
                 f"{', '.join(shape.part_names)}"
             )
-        chosen = [shape.part_names.index(name) for name in self.parts or shape.part_names]
-        corners = np.unique(shape.faces[np.isin(shape.part_labels, chosen)])
+        corners = shape.part_vertices(*(self.parts or shape.part_names))
         try:
-            planes = ConvexHull(shape.vertices[corners]).equations  # (f, 4): outward normal, offset
+            planes = ConvexHull(corners).equations  # (f, 4): outward normal, offset
         except QhullError as error:
             raise TaskError(
                 f"Inside.parts: {', '.join(self.parts)} of {self.other} is flat: name a part more"

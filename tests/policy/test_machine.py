@@ -66,6 +66,16 @@ def test_grasp_uses_the_gripper_and_runs_to_the_end():
     assert memory.status.waypoints_reached[0].IsNearlyEqualTo(X_GOAL, 1e-12)
 
 
+def test_a_waypoint_without_offsets_is_gone_to_at_once_and_not_left():
+    still = replace(GRASP.waypoints[0], before_E=(0.0, 0.0, 0.0), after_W=(0.0, 0.0, 0.0))
+    memory, targets = run(make_machine(replace(GRASP, waypoints=(still,))), FakeInputs())
+    assert sorted(targets) == [0, 1, 2]
+    assert all(targets[k].X_WE.IsNearlyEqualTo(X_GOAL, 1e-12) for k in (1, 2))
+    assert [targets[k].opening_reached for k in (1, 2)] == [0.08, 0.01]
+    assert targets[1].speed_scale == still.speed_scale
+    assert len(memory.status.waypoints_reached) == 1
+
+
 def test_stack_presents_the_held_object_and_carries_it_into_the_hand_frame():
     aligner, inputs = FakeAligner(), FakeInputs()
     points_E = RNG.normal(size=(80, 3)) * 0.05

@@ -36,6 +36,15 @@ def test_mass_properties_of_a_box_are_the_textbook_s() -> None:
     np.testing.assert_allclose(properties.I_CcmO, np.diag(mass / 12 * squares), atol=1e-12)
 
 
+def test_part_vertices_are_those_of_the_part_s_faces() -> None:
+    mug = FAMILIES["mug"].build(FAMILIES["mug"].sample_parameters(np.random.default_rng(0)))
+    handle = mug.part_vertices("handle")
+    assert 0 < len(handle) < len(mug.vertices) and handle[:, 0].min() > 0.0
+    np.testing.assert_array_equal(mug.part_vertices(*mug.part_names), mug.vertices)
+    with pytest.raises(ShapeError, match="no part lid: underside"):
+        mug.part_vertices("handle", "lid")
+
+
 def test_with_mass_scales_mass_and_inertia() -> None:
     light, heavy = _box(), _box().with_mass(6.0)
     assert heavy.mass_properties.mass == pytest.approx(6.0)

@@ -17,7 +17,9 @@ from iga_drake.station.scenario import (
     load_scenario,
 )
 
-SHIPPED = ("grasp", "stack", "hang", "insert", "field", "one_of_everything")
+SHIPPED = ("grasp", "stack", "hang", "insert", "pour", "sweep", "field", "one_of_everything")
+# Time steps (s) other than the default.
+TIME_STEPS = {"pour": 0.0025, "sweep": 0.005}
 
 
 def _load(tmp_path, text: str) -> Scenario:
@@ -37,7 +39,7 @@ def _message(tmp_path, text: str) -> str:
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_scenarios_load(name):
     scenario = load_scenario(diagrams_dir() / f"{name}.yaml")
-    assert scenario.plant.time_step == 0.002
+    assert scenario.plant.time_step == TIME_STEPS.get(name, 0.002)
     assert len(scenario.camera_names) >= 2
 
 

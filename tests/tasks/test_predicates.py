@@ -180,6 +180,10 @@ def test_slip_is_in_the_hand_whatever_the_hand_does() -> None:
     assert _judged(still, carried, "slip") == pytest.approx(0.0, abs=1e-12)
     slipping = _snapshots(X_WE=hand, box=lambda t: hand(t) @ _pose([0, 0, 0.02 * t]) @ X_EO)
     assert _judged(still, slipping, "slip") == pytest.approx(0.02)
+    # Since the start, however long that is.
+    assert _judged(replace(still, for_last=np.inf), slipping, "slip") == pytest.approx(0.06)
+    reason = replace(still, for_last=np.inf).judge(SCENE, slipping).reason
+    assert "slipped in the hand since the start" in reason
     # Turning about its centre of mass is no slip.
     turning = _snapshots(
         X_WE=hand,
