@@ -15,7 +15,7 @@ from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.panda.model import HOME_POSITION
 from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
 from iga_drake.tasks.holding import centred_grip, draw_parameters, end_effector_pose, wrist_turn
-from iga_drake.tasks.placement import WorkArea
+from iga_drake.tasks.placement import TRIES, WorkArea
 from iga_drake.tasks.predicates import (
     AllOf,
     AtRest,
@@ -27,7 +27,7 @@ from iga_drake.tasks.predicates import (
     Touching,
     Upright,
 )
-from iga_drake.tasks.snapshots import ROBOT, TABLE
+from iga_drake.tasks.snapshots import ROBOT, TABLE, TaskError
 from iga_drake.tasks.task import Split, Task
 
 TARGET, HELD = "target", "grasped"
@@ -167,7 +167,7 @@ class Insert(Task):
     def make_shapes(seed: int) -> Mapping[str, ShapeInstance]:
         """Draws a shoe and a bottle until the bottle fits."""
         rng = np.random.default_rng(seed)
-        while True:
+        for _ in range(TRIES):
             family = str(rng.choice(sorted(_FOOTWEAR)))
             shoe = draw_parameters(family, _FOOTWEAR[family], rng)
             bottle = draw_parameters("bottle", _BOTTLE, rng)
@@ -179,6 +179,7 @@ class Insert(Task):
                     TARGET: target.with_mass(rng.uniform(*_SHOE_MASS)),
                     HELD: held.with_mass(rng.uniform(*_BOTTLE_MASS)),
                 }
+        raise TaskError(f"insert: seed {seed}: none of {TRIES} bottles fits into its shoe")
 
     def arrange(self, truth: SceneTruth, rng: np.random.Generator, mesh_folder: Path) -> Scene:
         shapes = truth.shapes

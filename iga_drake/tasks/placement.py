@@ -1,5 +1,6 @@
 """Where on the table a task's objects may stand."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from iga_drake.tasks.snapshots import TaskError
 
 CLEARANCE = 0.0003  # m between an object and the table at the start
-_TRIES = 10_000
+TRIES = 10_000  # draws of a place, or of shapes, until one will do
 _IN_FRONT = 0.2  # m, least x in W of a point that the hand has to get to
 
 
@@ -22,23 +23,30 @@ class WorkArea:
     # Least and greatest distance (m) from W's z axis of the point that has to be in reach.
     reach: tuple[float, float]
 
-    def draw_pose(self, rng: np.random.Generator, p_OF: np.ndarray | None = None) -> RigidTransform:
+    def draw_pose(
+        self,
+        rng: np.random.Generator,
+        p_OF: np.ndarray | None = None,
+        *,
+        serves: Callable[[RigidTransform], bool] = lambda X_WO: True,
+    ) -> RigidTransform:
         """X_WO of an upright object on the table at any yaw, its origin in the rectangle.
 
-        Its point `p_OF` (m, default: the origin) is within reach and in front of the robot. Raises
-        `TaskError` where the rectangle has no such place.
+        Its point `p_OF` (m, default: the origin) is within reach and in front of the robot, and the
+        pose `serves`. Raises `TaskError` where the rectangle has no such place.
         """
-        for _ in range(_TRIES):
+        for _ in range(TRIES):
             x, y = rng.uniform(self.lower, self.upper)
             if p_OF is None and not self._reaches(np.array([x, y])):
                 continue
             R_WO = RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi))
             X_WO = RigidTransform(R_WO, [x, y, CLEARANCE])
-            if p_OF is None or self._reaches(X_WO.multiply(p_OF)):
+            if (p_OF is None or self._reaches(X_WO.multiply(p_OF))) and serves(X_WO):
                 return X_WO
         raise TaskError(
-            f"WorkArea: none of {_TRIES} places between {self.lower} and {self.upper} m is "
-            f"{self.reach[0]} to {self.reach[1]} m from the robot's axis: move or widen it"
+            f"WorkArea: none of {TRIES} places between {self.lower} and {self.upper} m is "
+            f"{self.reach[0]} to {self.reach[1]} m from the robot's axis and "
+            "serves: move or widen it"
         )
 
     def _reaches(self, p_WF: np.ndarray) -> bool:

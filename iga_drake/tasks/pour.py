@@ -15,7 +15,7 @@ from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
 from iga_drake.tasks.holding import centred_grip, end_effector_pose
 from iga_drake.tasks.marbles import make_marble, marble_object
-from iga_drake.tasks.placement import WorkArea
+from iga_drake.tasks.placement import TRIES, WorkArea
 from iga_drake.tasks.predicates import (
     AllOf,
     AtRest,
@@ -25,7 +25,7 @@ from iga_drake.tasks.predicates import (
     Touching,
     Upright,
 )
-from iga_drake.tasks.snapshots import ROBOT
+from iga_drake.tasks.snapshots import ROBOT, TaskError
 from iga_drake.tasks.task import Split, Task
 
 TARGET, HELD, MARBLE = "target", "grasped", "marble"
@@ -102,7 +102,7 @@ def _pair(seed: int) -> dict[str, ShapeInstance]:
     rng = np.random.default_rng(seed)
     # Every third is a mug as well.
     family = FAMILIES["mug" if seed % 3 == 0 else "jug"]
-    while True:
+    for _ in range(TRIES):
         held = family.sample_parameters(rng)
         target = FAMILIES["mug"].sample_parameters(rng)
         if held["height"] > 0.19 or held["height"] < 0.1:
@@ -113,6 +113,7 @@ def _pair(seed: int) -> dict[str, ShapeInstance]:
         if _pours(vessel):
             mug = FAMILIES["mug"].build(target).with_mass(rng.uniform(0.2, 0.35))
             return {TARGET: mug, HELD: vessel}
+    raise TaskError(f"pour: seed {seed}: no two of {TRIES} vessels can be poured into each other")
 
 
 class Pour(Task):
@@ -183,10 +184,7 @@ class Pour(Task):
             roll=rng.uniform(-_GRIP_ROLL, _GRIP_ROLL),
         )
         X_EO = X_OE.inverse()
-        while True:
-            X_WT = _WORK_AREA.draw_pose(rng)
-            if _can_serve(X_WT):
-                break
+        X_WT = _WORK_AREA.draw_pose(rng, serves=_can_serve)
         colors = rng.permutation(len(_COLORS))
 
         def sdf(name: str, color: int) -> str:

@@ -17,7 +17,7 @@ from iga_drake.station.panda.model import HOME_POSITION, gripper_cloud
 from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
 from iga_drake.tasks.holding import centred_grip, end_effector_pose
 from iga_drake.tasks.marbles import make_marble, marble_object
-from iga_drake.tasks.placement import WorkArea
+from iga_drake.tasks.placement import TRIES, WorkArea
 from iga_drake.tasks.predicates import (
     AllOf,
     CountOf,
@@ -26,7 +26,7 @@ from iga_drake.tasks.predicates import (
     Predicate,
     Touching,
 )
-from iga_drake.tasks.snapshots import ROBOT
+from iga_drake.tasks.snapshots import ROBOT, TaskError
 from iga_drake.tasks.task import Split, Task
 
 TARGET, HELD = "target", "grasped"
@@ -107,7 +107,7 @@ def _is_free(brush: ShapeInstance, pan: ShapeInstance) -> bool:
 def _pair(seed: int) -> dict[str, ShapeInstance]:
     """Draws brush and dustpan until the one goes into the other."""
     rng = np.random.default_rng(seed)
-    while True:
+    for _ in range(TRIES):
         held = FAMILIES["brush"].sample_parameters(rng)
         target = FAMILIES["dustpan"].sample_parameters(rng)
         # Bristles wide and level enough to push three marbles, a handle that the hand gets around.
@@ -126,6 +126,7 @@ def _pair(seed: int) -> dict[str, ShapeInstance]:
         fits = swept_poses(brush, pan)[-1].translation()[2] < 0.01
         if stands and fits and _is_free(brush, pan):
             return {TARGET: pan, HELD: brush}
+    raise TaskError(f"sweep: seed {seed}: none of {TRIES} brushes goes into its dustpan")
 
 
 class Sweep(Task):
@@ -195,10 +196,9 @@ class Sweep(Task):
         )
         hand_T = [X_TH @ X_OE for X_TH in swept_poses(shapes[HELD], shapes[TARGET])]
         edge = shapes[TARGET].frames["edge"][:3, 3]
-        while True:
-            X_WT = _WORK_AREA.draw_pose(rng, edge)
-            if all(_can_serve(X_WT @ X_TE) for X_TE in hand_T):
-                break
+        X_WT = _WORK_AREA.draw_pose(
+            rng, edge, serves=lambda X_WT: all(_can_serve(X_WT @ X_TE) for X_TE in hand_T)
+        )
         colors = rng.permutation(len(_COLORS))
 
         def sdf(name: str, color: int, friction: float) -> str:
