@@ -1,5 +1,11 @@
 """The base of every error that this package raises on purpose."""
 
+import reprlib
+from collections.abc import Mapping
+from typing import Any
+
+TEXT_LIMIT = 2000  # characters of an error in one line
+
 
 class IgaDrakeError(Exception):
     """Bad input or a refused operation; the message names what was found and what to do."""
@@ -7,18 +13,49 @@ class IgaDrakeError(Exception):
 
 def error_text(error: BaseException) -> str:
     """An error in one line of words: this package's own speak for themselves, for all others the
-    type stands before the message."""
-    text = " ".join(str(error).split())
+    type stands before the message. At most `TEXT_LIMIT` characters."""
+    kind = type(error).__name__
+    try:
+        text = " ".join(str(error).split())
+    except Exception:  # its own text is broken
+        return kind
+    if len(text) > TEXT_LIMIT:
+        text = f"{text[: TEXT_LIMIT // 2]} ... {text[-TEXT_LIMIT // 4 :]}"
     if isinstance(error, IgaDrakeError) and text:
         return text
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+    return f"{kind}: {text}" if text else kind
+
+
+def shortened(value: object) -> str:
+    """A value in a few words, however large or deeply nested it is."""
+    return _SHORT.repr(value)
+
+
+def _short() -> reprlib.Repr:
+    short = reprlib.Repr()
+    short.maxlevel, short.maxlist, short.maxtuple, short.maxdict = 2, 8, 8, 4
+    short.maxstring, short.maxother, short.maxlong = 80, 80, 40
+    return short
+
+
+_SHORT = _short()
 
 
 class ConfigError(IgaDrakeError):
     """A setting is out of its range; the message names it by its full key."""
 
 
+def check_bounds(config: object, where: str, bounds: Mapping[str, tuple[float, float]]) -> None:
+    """Raises `ConfigError` for a field of `config`, a number or a list of numbers, that isn't
+    within its bounds, both allowed; `bounds` by the fields' names."""
+    for name, (low, high) in bounds.items():
+        value: Any = getattr(config, name)
+        values = value if isinstance(value, list | tuple) else [value]
+        ok = all(low <= each <= high for each in values)
+        check_range(ok, f"{where}.{name}", value, f"{low:g} to {high:g}")
+
+
 def check_range(ok: bool, key: str, value: object, allowed: str) -> None:
     """Raises `ConfigError` that names the setting, its value and what is allowed, unless `ok`."""
     if not ok:
-        raise ConfigError(f"{key}: {value!r} is out of range; allowed: {allowed}")
+        raise ConfigError(f"{key}: {shortened(value)} is out of range; allowed: {allowed}")

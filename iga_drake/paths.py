@@ -29,8 +29,17 @@ def diagrams_dir() -> Path:
 
 
 def cache_dir() -> Path:
-    """A writable folder for files derived once from other packages (converted meshes)."""
-    root = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    path = Path(root) / "iga_drake"
-    path.mkdir(parents=True, exist_ok=True)
+    """A writable folder for files derived once from other packages (converted meshes).
+
+    Raises `IgaDrakeError` where it can't be made.
+    """
+    try:
+        root = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+        path = Path(root) / "iga_drake"
+        path.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError) as error:  # the latter: no home
+        raise IgaDrakeError(
+            f"no folder to keep derived files in ({error}): name one that can be written to in the "
+            "environment variable XDG_CACHE_HOME"
+        ) from error
     return path

@@ -1,12 +1,13 @@
 """Checkpoints come back whole, and foreign or damaged files are refused by name."""
 
+import resource
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import save_file
 
-from iga_drake.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from iga_drake.checkpoint import FORMAT, CheckpointError, load_checkpoint, save_checkpoint
 
 TENSORS = {"a": torch.arange(6.0).reshape(2, 3), "b": torch.tensor([1, 2], dtype=torch.uint8)}
 
@@ -48,3 +49,30 @@ def test_a_truncated_file(tmp_path: Path, keep: int) -> None:
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(CheckpointError, match=r"x\.safetensors"):
         load_checkpoint(path, kind="thing")
+
+
+@pytest.mark.parametrize("card", ["[]", "3", "null", "{", "[" * 100_000, "\ud800"])
+def test_a_card_that_is_none(tmp_path: Path, card: str) -> None:
+    path = tmp_path / "x.safetensors"
+    metadata = {"format": FORMAT, "version": "1", "kind": "thing", "card": card}
+    try:
+        save_file(TENSORS, path, metadata)
+    except UnicodeEncodeError:  # safetensors itself refuses it
+        return
+    with pytest.raises(CheckpointError, match=r"x\.safetensors: ") as error:
+        load_checkpoint(path, kind="thing")
+    assert len(str(error.value)) < 3000
+
+
+def test_a_full_disk_leaves_the_old_checkpoint(tmp_path: Path) -> None:
+    path = tmp_path / "x.safetensors"
+    save_checkpoint(path, TENSORS, kind="thing", card={})
+    whole = path.read_bytes()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.raises((CheckpointError, OSError), match=r"x\.safetensors"):
+            save_checkpoint(path, {"a": torch.zeros(5000)}, kind="thing", card={})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert path.read_bytes() == whole and list(tmp_path.iterdir()) == [path]

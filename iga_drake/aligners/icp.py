@@ -8,9 +8,10 @@ registrations. Where an object's way up is known, its registrations start from t
 
 import numpy as np
 
-from iga_drake.aligners.protocol import AlignerError, PoseEstimate
-from iga_drake.demonstrations.alignment import Alignment, check_cloud, check_direction
+from iga_drake.aligners.protocol import AlignerError, PoseEstimate, check_question
+from iga_drake.demonstrations.alignment import Alignment, check_direction
 
+_MOST_STARTS = 1000
 _Ups = tuple[np.ndarray, np.ndarray]  # ways up (3,) of a source and of a goal
 
 
@@ -55,8 +56,14 @@ class IcpAligner:
     name = "icp"
 
     def __init__(self, *, starts: int = 24, refined: int = 3, voxel: float = 0.01):
-        self.starts = starts
-        self.refined = refined
+        for name, value in (("starts", starts), ("refined", refined)):
+            if not (float(value).is_integer() and 1 <= value <= _MOST_STARTS):
+                raise AlignerError(f"icp: {name} {value}, an integer from 1 to 1000 expected")
+        if not 1e-4 <= voxel <= 1:
+            raise AlignerError(f"icp: voxel {voxel} m, 0.0001 to 1 expected")
+        _open3d()  # not when the first object waits
+        self.starts = int(starts)
+        self.refined = int(refined)
         self.voxel = voxel
 
     def _register(
@@ -106,8 +113,7 @@ class IcpAligner:
     ) -> PoseEstimate:
         """See `Aligner.align`. One mode per demonstration; the energy is the mean distance in
         cm."""
-        if not context:
-            raise AlignerError("icp: the context is empty: give at least one demonstration")
+        grasped, target = check_question("icp", context, grasped, target, seed=seed)
         o3d = _open3d()
         rng = np.random.default_rng(seed)
 
@@ -116,8 +122,8 @@ class IcpAligner:
             pcd.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=0.02, max_nn=30))
             return pcd
 
-        test_A = cloud(check_cloud(grasped, "grasped"))
-        test_B = cloud(check_cloud(target, "target"))
+        test_A = cloud(grasped)
+        test_B = cloud(target)
         ups_A = _ups([a.grasped_up for a in context], grasped_up, "grasped_up")
         ups_B = _ups([a.target_up for a in context], target_up, "target_up")
         poses, energies = [], []

@@ -13,13 +13,14 @@ demonstrations have it, and otherwise changes nothing. An aligner may leave it u
 """
 
 import inspect
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from iga_drake.demonstrations.alignment import Alignment
-from iga_drake.errors import IgaDrakeError
+from iga_drake.demonstrations.alignment import Alignment, check_cloud
+from iga_drake.errors import IgaDrakeError, shortened
 
 
 class AlignerError(IgaDrakeError):
@@ -28,7 +29,11 @@ class AlignerError(IgaDrakeError):
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """Poses `X_WF` best first, with their energies and the probability of each mode."""
+    """Poses `X_WF` best first, with their energies and the probability of each mode.
+
+    Raises `AlignerError` where a shape is wrong, a number isn't finite, a pose isn't rigid (within
+    1e-6), a probability is below 0, or the familiarity lies outside of [0, 1].
+    """
 
     poses: np.ndarray  # (M, 4, 4) float64
     energies: np.ndarray  # (M,) ascending
@@ -38,17 +43,71 @@ class PoseEstimate:
     familiarity: float | None = None
 
     def __post_init__(self) -> None:
-        poses = np.asarray(self.poses, dtype=np.float64)
+        poses = self._numbers("poses")
         if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
             raise AlignerError(f"PoseEstimate.poses: expected (M>=1, 4, 4), got {poses.shape}")
-        object.__setattr__(self, "poses", poses)
         for name in ("energies", "probabilities"):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
+            value = self._numbers(name)
             if value.shape != (len(poses),):
                 raise AlignerError(
                     f"PoseEstimate.{name}: expected ({len(poses)},), got {value.shape}"
                 )
             object.__setattr__(self, name, value)
+        for name, value in (("poses", poses), *((n, getattr(self, n)) for n in _WEIGHTS)):
+            if not np.isfinite(value).all():
+                bad = int((~np.isfinite(value)).sum())
+                raise AlignerError(
+                    f"PoseEstimate.{name}: {bad} of {value.size} numbers are not finite"
+                )
+        if (self.probabilities < 0).any():
+            raise AlignerError(f"PoseEstimate.probabilities: {self.probabilities.min():g} is < 0")
+        R = poses[:, :3, :3]
+        off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max()
+        off = max(off, np.abs(poses[:, 3] - [0, 0, 0, 1]).max())
+        if not off <= _RIGID or not (np.linalg.det(R) > 0).all():
+            raise AlignerError(
+                f"PoseEstimate.poses: not rigid transforms (off by {off:.2g}): expected rotation "
+                "matrices of determinant 1 over rows (0, 0, 0, 1)"
+            )
+        poses = poses.copy()
+        poses[:, 3] = [0, 0, 0, 1]
+        object.__setattr__(self, "poses", poses)
+        if self.familiarity is not None:
+            familiarity = self._numbers("familiarity")
+            if familiarity.shape != () or not 0 <= familiarity <= 1:
+                raise AlignerError(
+                    f"PoseEstimate.familiarity: {shortened(self.familiarity)}, a number from 0 to "
+                    "1, or None, expected"
+                )
+            object.__setattr__(self, "familiarity", float(familiarity))
+
+    def _numbers(self, name: str) -> np.ndarray:
+        """The field as float64."""
+        value = getattr(self, name)
+        try:
+            return np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise AlignerError(
+                f"PoseEstimate.{name}: {type(value).__name__} found, numbers expected"
+            ) from error
+
+    @staticmethod
+    def of(found: Any) -> "PoseEstimate":
+        """What an aligner returned, whatever it is, as an estimate. Raises `AlignerError` for what
+        is none."""
+        missing = [name for name in ("poses", *_WEIGHTS) if not hasattr(found, name)]
+        if missing:
+            raise AlignerError(
+                f"returned {type(found).__name__}, a PoseEstimate is expected (it has no "
+                f"{', '.join(missing)})"
+            )
+        return PoseEstimate(
+            found.poses, found.energies, found.probabilities, getattr(found, "familiarity", None)
+        )
+
+
+_WEIGHTS = ("energies", "probabilities")
+_RIGID = 1e-6
 
 
 @runtime_checkable
@@ -73,11 +132,54 @@ class Aligner(Protocol):
         """Aligns `grasped` (P, 3) with `target` (Q, 3) as in `context` (one or more alignments).
 
         `grasped_up` and `target_up` (3,) are the objects' ways up, None where unknown.
-        Deterministic for a seed. Raises `AlignerError` for an empty context, and `CloudError`
-        (`demonstrations.alignment`) for clouds that are empty, not finite or too small, and for
-        directions that are no unit vectors.
+        Deterministic for a seed. Raises `AlignerError` for a context, a seed or a cloud's size that
+        can't be (`check_question`), and `CloudError` (`demonstrations.alignment`) for clouds that
+        are empty, not finite or have too few points, and for directions that are no unit vectors.
         """
         ...
+
+
+def check_question(
+    name: str,
+    context: Sequence[Alignment],
+    grasped: np.ndarray,
+    target: np.ndarray,
+    *,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The clouds of a question to the aligner `name`, as finite float64 arrays (P, 3) and (Q, 3).
+
+    Raises `AlignerError`, which begins with `name`, for a context that is empty or holds something
+    else than alignments, for a seed below 0, and for a cloud that is `MOST_TIMES` as large or small
+    as those of the demonstrations; `CloudError` for a cloud that can't be used.
+    """
+    if not context:
+        raise AlignerError(f"{name}: the context is empty: give at least one demonstration")
+    for alignment in context:
+        if not isinstance(alignment, Alignment):
+            raise AlignerError(
+                f"{name}: the context holds {type(alignment).__name__}, alignments are expected"
+            )
+    if not (isinstance(seed, int | np.integer) and 0 <= seed < 2**63):
+        raise AlignerError(f"{name}: seed {shortened(seed)}, an integer from 0 to 2^63 expected")
+    clouds = check_cloud(grasped, "grasped"), check_cloud(target, "target")
+    for role, cloud in zip(("grasped", "target"), clouds, strict=True):
+        size = _size(cloud)
+        shown = float(np.median([_size(getattr(alignment, role)) for alignment in context]))
+        if not shown / MOST_TIMES <= size <= shown * MOST_TIMES:
+            raise AlignerError(
+                f"{name}: the cloud '{role}' is {size:.3g} m large, in the demonstrations "
+                f"{shown:.3g} m: are both in m?"
+            )
+    return clouds
+
+
+MOST_TIMES = 10.0  # how many times as large or small as in the demonstrations a cloud may be
+
+
+def _size(cloud: np.ndarray) -> float:
+    """m, twice the median distance of the points from their middle; stray points don't count."""
+    return 2 * float(np.median(np.linalg.norm(cloud - np.median(cloud, axis=0), axis=1)))
 
 
 def check_aligns(aligner: Aligner, name: str) -> None:

@@ -7,6 +7,7 @@ group `iga_drake.aligners`. A factory takes the aligner's options as keywords.
 from typing import Any
 
 from iga_drake.aligners.protocol import Aligner, AlignerError, check_aligns
+from iga_drake.errors import error_text, shortened
 from iga_drake.registry import Registry
 
 # Names that stand beside aligners and that no aligner may take: the scripted expert of episodes,
@@ -36,17 +37,24 @@ def check_aligner(name: str) -> None:
 def make_aligner(name: str, **options: Any) -> Aligner:
     """The aligner `name` with its own keyword options.
 
-    Raises `AlignerError` for an unknown name, for options that the aligner doesn't take, and for an
-    aligner that can't be asked as the protocol says.
+    Raises `AlignerError` for an unknown name, for options that the aligner doesn't take, for a
+    package that it needs and that isn't there, and for an aligner that can't be asked as the
+    protocol says.
     """
     factory = _REGISTRY.factory(name)
     try:
         aligner = factory(**options)
-    except TypeError as error:
+    except ImportError as error:
+        raise AlignerError(
+            f"aligner '{name}': a package that it needs can't be imported ({error_text(error)}): "
+            "install it"
+        ) from error
+    except (TypeError, ValueError) as error:
         if not options:
             raise
         raise AlignerError(
-            f"aligner options {options}: '{name}' does not take them: {error}"
+            f"aligner options {shortened(options)}: '{name}' does not take them: "
+            f"{error_text(error)}"
         ) from error
     check_aligns(aligner, name)
     return aligner

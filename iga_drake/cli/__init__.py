@@ -1,20 +1,33 @@
 """The `iga` command: one module a subcommand, imported when it is asked for.
 
 Exit status: 0 for success, 1 for an episode that did not succeed, 2 for bad input (one line says
-what was found and what to do), 3 for an internal error (a bug: traceback and one line).
+what was found and what to do), 3 for an internal error (a bug: one line, which says where the
+traceback is), 130 where it was interrupted (Ctrl-C).
 """
 
 import argparse
+import contextlib
+import errno
 import importlib
 import logging
+import os
 import sys
+import time
 import traceback
 from collections.abc import Sequence
 
-from iga_drake.cli.status import BAD_INPUT, FAILURE, INTERNAL, SUCCESS
-from iga_drake.errors import IgaDrakeError
+from iga_drake.cli.status import BAD_INPUT, FAILURE, INTERNAL, INTERRUPTED, SUCCESS
+from iga_drake.errors import IgaDrakeError, error_text
+from iga_drake.paths import cache_dir
 
-__all__ = ["BAD_INPUT", "FAILURE", "INTERNAL", "SUCCESS", "main"]
+__all__ = ["BAD_INPUT", "FAILURE", "INTERNAL", "INTERRUPTED", "SUCCESS", "main"]
+
+_KEPT = 20  # tracebacks
+# What a machine says of a disk, a folder or the network rather than of this code.
+_OUTSIDE = {
+    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE,
+    errno.EIO, errno.EADDRINUSE,
+}  # fmt: skip
 
 # Each is a module of this package with `add_arguments(parser)` and `run(arguments) -> int`.
 COMMANDS = {
@@ -45,18 +58,45 @@ def main(arguments: Sequence[str] | None = None) -> int:
         module.add_arguments(options)
         return int(module.run(options.parse_args(given[1:])))
     except IgaDrakeError as error:
-        print(f"iga {command}: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"iga {command}: {error_text(error)}", file=sys.stderr)
         return BAD_INPUT
+    except KeyboardInterrupt:
+        print(f"iga {command}: interrupted", file=sys.stderr)
+        return INTERRUPTED
     except BrokenPipeError:
+        with contextlib.suppress(OSError):  # nobody reads: no word of it when Python ends
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILURE
-    except Exception as error:
-        if isinstance(error, OSError) and error.filename is not None:
-            print(f"iga {command}: {error.filename}: {error.strerror}", file=sys.stderr)
+    except OSError as error:
+        if error.filename is not None or error.errno in _OUTSIDE:
+            where = f"{error.filename}: " if error.filename is not None else ""
+            print(f"iga {command}: {where}{error.strerror}", file=sys.stderr)
             return BAD_INPUT
-        traceback.print_exc()
-        text = " ".join(str(error).split())
-        print(f"iga {command}: internal error: {type(error).__name__}: {text}", file=sys.stderr)
-        return INTERNAL
+        return _internal(command, error)
+    except SystemExit as error:
+        if error.code is None or isinstance(error.code, int):
+            raise
+        return _internal(command, error)  # Drake ends so where a condition of its own is broken
+    except Exception as error:
+        return _internal(command, error)
+
+
+def _internal(command: str, error: BaseException) -> int:
+    """Tells of a bug in one line, and keeps the traceback in a file."""
+    try:
+        folder = cache_dir() / "tracebacks"
+        folder.mkdir(exist_ok=True)
+        for old in sorted(folder.glob("*.txt"))[: 1 - _KEPT]:
+            old.unlink(missing_ok=True)
+        path = folder / f"{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.txt"
+        path.write_text("".join(traceback.format_exception(error)), encoding="utf-8")
+        where = f"; traceback in {path}"
+    except (IgaDrakeError, OSError):
+        traceback.print_exception(error)
+        where = ""
+    kind, text = type(error).__name__, error_text(error).partition(": ")[2]
+    print(f"iga {command}: internal error: {kind}: {text}{where}", file=sys.stderr)
+    return INTERNAL
 
 
 def _is_warning(record: logging.LogRecord) -> bool:

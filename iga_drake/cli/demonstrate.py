@@ -1,11 +1,14 @@
 """`iga demonstrate`: the scripted expert records demonstrations."""
 
 import argparse
+import sys
 from pathlib import Path
 
 from iga_drake.cli.options import seed
 from iga_drake.cli.scenarios import add_scenario_arguments, scenario_of
-from iga_drake.cli.status import SUCCESS
+from iga_drake.cli.status import SUCCESS, CommandError
+
+MOST = 10_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -17,15 +20,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Records and writes them; nothing of somebody else's is overwritten."""
+    """Records and writes them, or goes on with a recording that was interrupted; nothing of
+    somebody else's is overwritten."""
+    from iga_drake.demonstrations.recording import Recording
     from iga_drake.demonstrations.store import check_replaceable, write_demonstrations
     from iga_drake.tasks.episode import record_demonstrations
+    from iga_drake.tasks.registry import make_task
+    from iga_drake.version import code_version
 
+    if not 1 <= arguments.count <= MOST:
+        raise CommandError(f"--count {arguments.count}: 1 to {MOST} demonstrations")
     scenario = scenario_of(arguments)
+    task = make_task(scenario.task.name).name
     check_replaceable(arguments.out)  # before minutes of recording
-    demonstrations = record_demonstrations(
-        scenario, count=arguments.count, first_seed=arguments.seed
-    )
+    key = {"scenario": scenario.digest, "seed": arguments.seed, "code": code_version()}
+    recording = Recording(arguments.out, task=task, key=key)
+    try:
+        demonstrations = record_demonstrations(
+            scenario, count=arguments.count, first_seed=arguments.seed, recording=recording
+        )
+    except KeyboardInterrupt:
+        again = "the same command goes on from there"
+        print(f"{recording.kept} demonstrations are kept: {again}", file=sys.stderr)
+        raise
     write_demonstrations(arguments.out, demonstrations)
+    recording.end()
     print(f"{len(demonstrations)} demonstrations of '{demonstrations.task}' in {arguments.out}")
     return SUCCESS

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from iga_drake.aligners.registry import ORACLE, make_aligner
 from iga_drake.cli.options import add_aligner_options, aligner_options, names
-from iga_drake.files import write_text
+from iga_drake.files import check_output, write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,6 +47,8 @@ def run(arguments: argparse.Namespace) -> None:
     )
     from iga_drake.evaluation.results import ResultsStore
 
+    for card in (arguments.card, arguments.energy_card):
+        check_output(card, begins=(b"#",))
     short = {name: getattr(arguments, name) for name in ("weights", "energy")}
     given = {name: path for name, path in short.items() if path is not None}
     asked = [name for name in arguments.aligner if name != ORACLE]

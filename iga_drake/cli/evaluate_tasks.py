@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from iga_drake.aligners.registry import EXPERT
 from iga_drake.cli.options import add_aligner_options, aligner_options, names, seed
 from iga_drake.cli.scenarios import add_overlay_arguments, scenario_of, with_aligner
-from iga_drake.cli.status import CommandError
+from iga_drake.cli.status import INTERNAL, SUCCESS, CommandError
 
 if TYPE_CHECKING:
     from iga_drake.evaluation.task_success import Trial, TrialResult
@@ -31,10 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
-def run(arguments: argparse.Namespace) -> None:
+def run(arguments: argparse.Namespace) -> int:
     """Runs the trials, tells each verdict, prints the table."""
     from iga_drake.evaluation.results import ResultsStore
-    from iga_drake.evaluation.task_success import evaluate, format_table, summarise_trials
+    from iga_drake.evaluation.task_success import BROKEN, evaluate, format_table, summarise_trials
 
     if arguments.trials < 1:
         raise CommandError(f"--trials {arguments.trials}: at least 1 is needed")
@@ -42,14 +42,21 @@ def run(arguments: argparse.Namespace) -> None:
         if not getattr(arguments, option):
             raise CommandError(f"--{option}: empty, at least one name is needed")
     store = ResultsStore(arguments.results) if arguments.results else None
-    results = evaluate(
-        _trials(arguments), processes=arguments.processes, store=store, on_result=_show
-    )
+    trials = _trials(arguments)
+    try:
+        results = evaluate(trials, processes=arguments.processes, store=store, on_result=_show)
+    except KeyboardInterrupt:
+        if store:
+            print(f"results so far are in {store.path}", file=sys.stderr)
+        raise
     if arguments.json:
         document = {"summary": summarise_trials(results), "trials": [asdict(r) for r in results]}
         print(json.dumps(document, indent=2))
     else:
         print(format_table(results))
+    if any(result.cause == BROKEN for result in results):
+        return INTERNAL
+    return SUCCESS
 
 
 def _trials(arguments: argparse.Namespace) -> "list[Trial]":

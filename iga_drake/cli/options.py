@@ -12,8 +12,8 @@ from iga_drake.cli.status import CommandError
 def seed(text: str) -> int:
     """A seed, as argparse takes it: NumPy knows none below 0."""
     number = int(text)
-    if number < 0:
-        raise argparse.ArgumentTypeError(f"{number} found, an integer >= 0 expected")
+    if not 0 <= number < 2**31:
+        raise argparse.ArgumentTypeError(f"{number} found, an integer from 0 to 2^31 - 1 expected")
     return number
 
 

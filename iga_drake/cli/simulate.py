@@ -8,7 +8,7 @@ from pathlib import Path
 from iga_drake.cli.options import add_aligner_options, aligner_options, seed
 from iga_drake.cli.scenarios import add_scenario_arguments, scenario_of, with_aligner
 from iga_drake.cli.status import FAILURE, SUCCESS
-from iga_drake.files import write_text
+from iga_drake.files import check_output, write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,6 +32,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Runs the episode, tells how it goes, writes what was asked for."""
     from iga_drake.tasks.episode import Episode
 
+    check_output(arguments.html)  # before minutes of simulation
+    check_output(arguments.result, begins=(b'{"task"',))
     scenario = scenario_of(arguments)
     name = arguments.aligner or scenario.aligner.name
     scenario = with_aligner(scenario, name, aligner_options(arguments, [name])[name])

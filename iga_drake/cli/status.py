@@ -2,8 +2,8 @@
 
 from iga_drake.errors import IgaDrakeError
 
-# INTERNAL is a bug: the exception and its traceback are printed.
-SUCCESS, FAILURE, BAD_INPUT, INTERNAL = 0, 1, 2, 3
+# INTERNAL is a bug: one line says what and where the traceback is. INTERRUPTED is the shells' own.
+SUCCESS, FAILURE, BAD_INPUT, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130
 
 
 class CommandError(IgaDrakeError):

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from iga_drake.files import write_text
+from iga_drake.files import check_output, write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,6 +19,7 @@ def run(arguments: argparse.Namespace) -> None:
     from iga_drake.demonstrations.store import read_demonstrations
     from iga_drake.viewing.replay import demonstrations_html, serve_demonstrations
 
+    check_output(arguments.html)
     demonstrations = read_demonstrations(arguments.folder)
     for index, demonstration in enumerate(demonstrations.demonstrations):
         clouds = ", ".join(

@@ -13,7 +13,7 @@ import torch
 from scipy.ndimage import minimum_filter
 from torch import Tensor
 
-from iga_drake.errors import check_range
+from iga_drake.errors import check_bounds, check_range
 
 LOST = 0.0  # depth of a pixel without a measurement, as RealSense cameras and Drake report it
 _PATCHES = 32  # of correlated noise along an image's side, a power of two; they repeat
@@ -52,10 +52,18 @@ class DepthNoise:
 
     def check(self, where: str = "noise") -> None:
         """Raises `ConfigError` for a value out of range."""
-        for name in ("focal_baseline", "patch", "quantum"):
-            check_range(getattr(self, name) > 0, f"{where}.{name}", getattr(self, name), "> 0")
-        for name in ("disparity", "patch_disparity", "flying"):
-            check_range(getattr(self, name) >= 0, f"{where}.{name}", getattr(self, name), ">= 0")
+        check_bounds(
+            self,
+            where,
+            {
+                "focal_baseline": (1e-3, 1e6),
+                "disparity": (0.0, 100.0),
+                "patch_disparity": (0.0, 100.0),
+                "patch": (1e-4, 10.0),
+                "quantum": (1e-6, 100.0),
+                "flying": (0.0, 10.0),
+            },
+        )
         kept, lost = self.grazing_kept, self.grazing_lost
         check_range(0 <= lost <= kept <= 1, f"{where}.grazing_lost", lost, f"0..{kept}")
         lost, flying = self.edge_lost, self.edge_flying

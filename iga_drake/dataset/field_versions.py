@@ -17,7 +17,7 @@ from iga_drake.dataset.field import (
     strays,
     table,
 )
-from iga_drake.dataset.samples import Sample
+from iga_drake.dataset.samples import ATTEMPTS, Sample, SampleError
 from iga_drake.errors import IgaDrakeError
 
 STRAY_SHARE = 0.05
@@ -67,7 +67,7 @@ def _half(sample: Sample, clouds: list[list[FieldCloud]], rng: np.random.Generat
 def _mixed(sample: Sample, clouds: list[list[FieldCloud]], rng: np.random.Generator) -> None:
     for role, own in enumerate(clouds):
         for n in range(len(own)):
-            while True:
+            for _ in range(ATTEMPTS):
                 own[n] = disturb(
                     sample.points[role, n],
                     rng,
@@ -77,6 +77,8 @@ def _mixed(sample: Sample, clouds: list[list[FieldCloud]], rng: np.random.Genera
                 )
                 if len(own[n].points) >= LEAST:
                     break
+            else:
+                raise SampleError(f"a cloud of {len(sample.points[role, n])} points is too small")
 
 
 def _up(sample: Sample, role: int, n: int, rng: np.random.Generator) -> np.ndarray:

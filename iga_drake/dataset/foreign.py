@@ -4,8 +4,10 @@ import numpy as np
 
 from iga_drake.dataset.samples import (
     COMPOSITE,
+    MOST_SKIPPED,
     Sample,
     SampleConfig,
+    SampleError,
     category_names,
     make_sample,
     stream_index,
@@ -18,7 +20,8 @@ FOREIGN_KINDS = ("both", "grasped", "target")  # which test objects are others, 
 def foreign_sample(split: str, index: int, config: SampleConfig | None = None) -> Sample:
     """The next sample of a set after `index` whose objects are of other families.
 
-    Composites are all unlike. Raises `SplitError` for an unknown set.
+    Composites are all unlike. Raises `SplitError` for an unknown set, `SampleError` where all of
+    its objects are alike.
     """
     chosen = sample_set(split)
     settings = config or SampleConfig()
@@ -30,6 +33,8 @@ def foreign_sample(split: str, index: int, config: SampleConfig | None = None) -
     own, other = families(index), index + 1
     while own & families(other):
         other += 1
+        if other > index + MOST_SKIPPED:
+            raise SampleError(f"set '{split}': {MOST_SKIPPED} samples share a family with {index}")
     return make_sample(split, other, config)
 
 

@@ -21,7 +21,9 @@ from scipy.spatial.transform import Rotation
 from iga_drake.dataset.depth_camera import observe
 from iga_drake.dataset.depth_noise import DepthNoise
 from iga_drake.dataset.samples import (
+    ATTEMPTS,
     SampleConfig,
+    SampleError,
     camera_positions,
     instance_meshes,
     stream_index,
@@ -70,21 +72,23 @@ def make_occupancy_sample(
     split: str, index: int, config: OccupancyConfig | None = None
 ) -> OccupancySample:
     """Sample `index` of the set `split` of splits.yaml: an instance of A (even indices) or of B
-    (odd) of the set's sample index // 2. Raises `SplitError` for an unknown set.
+    (odd) of the set's sample index // 2.
+
+    Raises `SplitError` for an unknown set, `SampleError` where the object can't be seen.
     """
     config = config or OccupancyConfig()
     chosen = sample_set(split)
     pair, role = divmod(index, 2)
     k = stream_index(chosen, pair, _SHAPES)
     category, instances, faces, _ = instance_meshes(chosen, k, role, _SHAPES)
-    attempt = 0
-    while True:
+    for attempt in range(ATTEMPTS):
         rng = chosen.rng("views", k, role, attempt, _STREAM)
         vertices = instances[_INSTANCE] @ Rotation.random(random_state=rng).as_matrix().T
         points = _observed(rng, vertices, faces, config, chosen.noise)
         if points is not None:
             break
-        attempt += 1
+    else:
+        raise SampleError(f"sample {index} of '{split}': the cameras see too little of its object")
     surface, face = outer_surface(rng, vertices, faces, config.surface_points)
     queries, uniform = _queries(rng, surface, vertices, config)
     # Labels are of the queries as they are stored.

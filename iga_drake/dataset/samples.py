@@ -21,6 +21,7 @@ from iga_drake.dataset.depth_noise import DepthNoise
 from iga_drake.dataset.field import CLUTTER, FieldCloud, FieldConfig, disturb
 from iga_drake.dataset.relations import RelatedPairs, related_categories, related_pairs
 from iga_drake.dataset.splits import SampleSet, family_names, sample_set
+from iga_drake.errors import IgaDrakeError
 from iga_drake.geometry.rigid_fit import rigid_fit
 from iga_drake.shapes.composite import CompositeCategory
 from iga_drake.shapes.deformers import DeformableShape, Deformer, LatticeDeformer, PartDeformer
@@ -40,6 +41,14 @@ _CALIBRATION = (0.0, 2.5)  # times the standard deviation of a camera's place, l
 
 
 _APART = 48  # samples between two that show the same objects
+
+
+ATTEMPTS = 200  # to see the objects of a sample
+MOST_SKIPPED = 10_000  # samples in a row that a set leaves out
+
+
+class SampleError(IgaDrakeError):
+    """A sample can't be made of these objects."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +156,10 @@ class _Object:
 
 
 def make_sample(split: str, index: int, config: SampleConfig | None = None) -> Sample:
-    """Sample `index` of the set `split` of splits.yaml. Raises `SplitError` for an unknown set."""
+    """Sample `index` of the set `split` of splits.yaml.
+
+    Raises `SplitError` for an unknown set, `SampleError` where its objects can't be seen.
+    """
     config = config or SampleConfig()
     chosen = sample_set(split)
     k = stream_index(chosen, index, config)
@@ -161,12 +173,14 @@ def make_sample(split: str, index: int, config: SampleConfig | None = None) -> S
         modes = [_Related(related_pairs(chosen, k, SIZE), objects, config)]
     else:
         modes = [_Alignment(chosen, k, mode, objects, config) for mode in range(chosen.modes)]
-    attempt = 0
-    while True:
+    for attempt in range(ATTEMPTS):
         sample = _observe(chosen, k, attempt, objects, modes, config)
         if sample is not None:
             return sample
-        attempt += 1
+    raise SampleError(
+        f"sample {index} of '{split}': the cameras see too little of its objects in {ATTEMPTS} "
+        "arrangements: are there meshes that are too small or too thin?"
+    )
 
 
 def object_index(chosen: SampleSet, k: int) -> int:
@@ -223,6 +237,11 @@ def stream_index(chosen: SampleSet, index: int, config: SampleConfig) -> int:
     kept = _kept(chosen.name, config)
     k = kept[-1] + 1 if kept else 0
     while len(kept) <= index:
+        if k > MOST_SKIPPED + (kept[-1] if kept else 0):
+            raise SampleError(
+                f"set '{chosen.name}': {MOST_SKIPPED} samples in a row with symmetric families, "
+                "which it leaves out: give it others"
+            )
         symmetries = [_symmetry(name) for name in category_names(chosen, k, config)]
         if all(s.is_trivial or not s.exact for s in symmetries):
             kept.append(k)

@@ -11,9 +11,18 @@ class CloudError(IgaDrakeError):
     """A cloud or a direction has a wrong shape, invalid numbers, or a cloud too few points."""
 
 
+def _numbers(value: object, name: str) -> np.ndarray:
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise CloudError(
+            f"{name}: {type(value).__name__} found, an array of numbers expected: {error}"
+        ) from error
+
+
 def check_cloud(cloud: np.ndarray, name: str, minimum: int = 16) -> np.ndarray:
     """Returns `cloud` as a finite (P, 3) float64 array or raises `CloudError` naming `name`."""
-    array = np.asarray(cloud, dtype=np.float64)
+    array = _numbers(cloud, name)
     if array.ndim != 2 or array.shape[1] != 3:
         raise CloudError(f"{name}: expected an array of shape (P, 3), got {array.shape}")
     if not np.isfinite(array).all():
@@ -38,7 +47,7 @@ def check_cloud(cloud: np.ndarray, name: str, minimum: int = 16) -> np.ndarray:
 def check_direction(direction: np.ndarray, name: str) -> np.ndarray:
     """Returns `direction` as a finite (3,) float64 unit vector or raises `CloudError` naming
     `name`; a length within 0.001 of 1 is set right."""
-    array = np.asarray(direction, dtype=np.float64)
+    array = _numbers(direction, name)
     if array.shape != (3,):
         raise CloudError(f"{name}: expected an array of shape (3,), got {array.shape}")
     length = float(np.linalg.norm(array))

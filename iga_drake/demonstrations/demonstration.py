@@ -51,7 +51,7 @@ def _rigid(name: str, pose: object) -> np.ndarray:
     X = _finite(name, pose, (4, 4))
     R = X[:3, :3]
     if (
-        np.abs(R.T @ R - np.eye(3)).max() > 1e-6
+        not np.abs(R.T @ R - np.eye(3)).max() <= 1e-6
         or np.linalg.det(R) < 0
         or not np.array_equal(X[3], [0, 0, 0, 1])
     ):
@@ -94,7 +94,7 @@ class Observation:
                 raise DemonstrationError(
                     f"{name}: {value!r} found, one of {', '.join(allowed)} expected"
                 )
-        if abs(np.linalg.norm(self.gravity) - 1) > 1e-6:
+        if not abs(np.linalg.norm(self.gravity) - 1) <= 1e-6:
             raise DemonstrationError(
                 f"gravity: {self.gravity} has length {np.linalg.norm(self.gravity):.4g}, a unit "
                 "vector that points down is expected"

@@ -46,7 +46,7 @@ def check_plausible(demonstration: Demonstration) -> None:
         moved = grasped @ waypoint.X_WE[:3, :3].T + waypoint.X_WE[:3, 3]
         # A sample of the larger cloud is enough for a gap of this size.
         gap = float(cKDTree(target).query(moved[:: max(1, len(moved) // 500)])[0].min())
-        if gap > GAP:
+        if not gap <= GAP:
             raise DemonstrationError(
                 f"{where}: '{waypoint.grasped}' carried there by X_WE is {gap:.2f} m away from "
                 f"'{waypoint.target}', at most {GAP} m expected: is X_WE inverted, or a cloud in "
@@ -54,7 +54,8 @@ def check_plausible(demonstration: Demonstration) -> None:
             )
     if demonstration.trajectory is not None:
         openings = demonstration.trajectory.openings
-        if openings.min() < -OPENING_SLACK or openings.max() > HAND_OPENING_MAX + OPENING_SLACK:
+        most = HAND_OPENING_MAX + OPENING_SLACK
+        if not ((openings >= -OPENING_SLACK) & (openings <= most)).all():
             raise DemonstrationError(
                 f"trajectory: openings from {openings.min():g} to {openings.max():g} m found, 0 to "
                 f"{HAND_OPENING_MAX} m expected"
@@ -86,7 +87,7 @@ def _check_observation(where: str, observation: Observation) -> None:
         )
     if observation.frame == "E":
         distance = float(np.linalg.norm(np.median(points, axis=0)))
-        if distance > REACH:
+        if not distance <= REACH:
             raise DemonstrationError(
                 f"{where}: its middle is {distance:.2f} m from the end effector, at most {REACH} m "
                 "expected of what moves with the hand: is it in another frame than E?"

@@ -13,7 +13,6 @@ import hashlib
 import json
 import math
 import os
-import secrets
 import shutil
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,8 @@ from iga_drake.demonstrations.demonstration import (
     Waypoint,
 )
 from iga_drake.demonstrations.plausibility import check_plausible
+from iga_drake.errors import shortened
+from iga_drake.files import check_output_folder
 
 FORMAT = "iga-drake demonstrations"
 VERSION = 2
@@ -44,17 +45,19 @@ _AGAIN = "copy the folder again or record it again with `iga demonstrate`"
 def write_demonstrations(folder: Path | str, demonstrations: DemonstrationSet) -> None:
     """Writes the set as a new folder, or in place of an older set; all of it or nothing.
 
-    Raises `DemonstrationError` where `folder` exists and is not a demonstrations folder, or where a
-    demonstration can't be true (`check_plausible`).
+    A process that is ended meanwhile leaves the older set, at the latest when this is called again.
+    Raises `DemonstrationError` where `folder` exists and holds anything but demonstrations
+    (`check_replaceable`), where a demonstration can't be true (`check_plausible`), or where the
+    folder can't be written.
     """
     folder = Path(folder)
     check_replaceable(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    token = secrets.token_hex(4)
-    partial = folder.parent / f".{folder.name}.{token}.partial"
-    old = folder.parent / f".{folder.name}.{token}.old"
-    partial.mkdir()
+    folder = folder.resolve()  # what a link points to is replaced, not the link
+    partial, old = (folder.parent / f".{folder.name}.{kind}" for kind in ("partial", "old"))
     try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir()
         entries = []
         for index, demonstration in enumerate(demonstrations.demonstrations):
             path = folder / _file_name(index)
@@ -84,17 +87,61 @@ def write_demonstrations(folder: Path | str, demonstrations: DemonstrationSet) -
         raise DemonstrationError(
             f"{folder}: names and provenance must be plain JSON values: {error}"
         ) from error
+    except OSError as error:
+        raise DemonstrationError(f"{folder}: can't be written ({error.strerror})") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def check_replaceable(folder: Path) -> None:
-    """Raises `DemonstrationError` where `folder` exists and is not a demonstrations folder."""
-    occupied = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
-    if occupied and not (folder / MANIFEST).is_file():
+    """Raises `DemonstrationError` where `folder` exists and holds anything but demonstrations.
+
+    An older set that a process left beside it when it was ended while replacing it is put back.
+    """
+    folder = Path(folder)
+    try:
+        folder = folder.resolve()
+        old = folder.parent / f".{folder.name}.old"
+        if (old / MANIFEST).is_file():
+            if folder.exists():
+                _check_own(old)
+                shutil.rmtree(old, ignore_errors=True)
+            else:
+                os.rename(old, folder)
+        if folder.exists() and not folder.is_dir():
+            raise DemonstrationError(
+                f"{folder}: is no folder, so it is not overwritten: name another"
+            )
+        if folder.exists() and any(folder.iterdir()):
+            _check_own(folder)
+    except (OSError, RuntimeError) as error:  # the latter: links in a circle
+        raise DemonstrationError(f"{folder}: can't be written ({error})") from error
+    check_output_folder(folder)
+
+
+def _check_own(folder: Path) -> None:
+    """Raises `DemonstrationError` unless a folder holds demonstrations and nothing else."""
+    if not (folder / MANIFEST).is_file():
         raise DemonstrationError(
             f"{folder}: exists and holds no {MANIFEST}, so it is not overwritten: name a new folder"
+        )
+    try:
+        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        own = manifest["format"] == FORMAT
+        files = {MANIFEST, *(str(entry["file"]) for entry in manifest["demonstrations"])}
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        own, files = False, set()
+    if not own:
+        raise DemonstrationError(
+            f"{folder}: its {MANIFEST} is not one of demonstrations, so it is not overwritten: "
+            "name a new folder"
+        )
+    others = sorted(entry.name for entry in folder.iterdir() if entry.name not in files)
+    if others:
+        raise DemonstrationError(
+            f"{folder}: holds {shortened(others)} besides demonstrations, so it is not "
+            "overwritten: move that away or name a new folder"
         )
 
 

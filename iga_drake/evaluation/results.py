@@ -6,9 +6,12 @@ its options and the digest of its weights, the seed or index, and the digest of 
 of them differs the row is another one.
 """
 
+import contextlib
 import dataclasses
+import errno
 import hashlib
 import json
+import os
 import sys
 import threading
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,7 +21,7 @@ from typing import Any
 
 from iga_drake.aligners.protocol import Aligner, weights_digest
 from iga_drake.errors import IgaDrakeError
-from iga_drake.files import write_text
+from iga_drake.files import check_output, write_text
 from iga_drake.version import code_version
 
 _START = '{"key": '  # of every line
@@ -31,14 +34,15 @@ class ResultsError(IgaDrakeError):
 class ResultsStore:
     """Results in one file of JSON lines, which is made or gone on from; safe among threads.
 
-    A last line that was cut off is dropped. Raises `ResultsError` for a file of another kind, which
-    is left as it is.
+    A last line that was cut off is dropped. Raises `ResultsError` or `OutputError` for a file of
+    another kind, which is left as it is, and for a place where none can be written.
     """
 
     def __init__(self, path: Path):
         self.path = path
         self._lock = threading.Lock()
         self._results: dict[str, dict[str, Any]] = {}
+        check_output(path, begins=(b"",))  # what is in it is looked at below
         if path.is_file():
             self._read()
 
@@ -47,13 +51,29 @@ class ResultsStore:
         return self._results.get(_canonical(key))
 
     def add(self, key: Mapping[str, Any], result: Mapping[str, Any]) -> None:
-        """Appends a result; it is in the file when this returns."""
+        """Appends a result; it is in the file when this returns.
+
+        Raises `ResultsError`, and leaves the file as it was, where it can't be written.
+        """
         line = json.dumps({"key": key, "result": result}) + "\n"
         with self._lock:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(line)
+            try:
+                self._append(line.encode())
+            except OSError as error:
+                raise ResultsError(f"{self.path}: can't be written ({error.strerror})") from error
             self._results[_canonical(key)] = json.loads(line)["result"]
+
+    def _append(self, data: bytes) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.open("ab", buffering=0) as file:
+            end = file.seek(0, os.SEEK_END)
+            try:
+                if file.write(data) != len(data):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            except OSError:
+                with contextlib.suppress(OSError):
+                    file.truncate(end)
+                raise
 
     def rows(self) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
         """Keys and results, in the file's order."""

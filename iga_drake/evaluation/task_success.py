@@ -3,9 +3,11 @@
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -16,9 +18,12 @@ from typing import Any
 from iga_drake.aligners.registry import EXPERT, make_aligner
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, folder_digest
+from iga_drake.files import process_lives
 from iga_drake.station.scenario import Scenario
 from iga_drake.tasks.episode import demonstrations_path
 from iga_drake.tasks.registry import make_task
+
+BROKEN = "error"  # cause of a trial whose process broke
 
 
 class EvaluationError(IgaDrakeError):
@@ -55,7 +60,7 @@ class TrialResult:
     seed: int
     split: str
     success: bool
-    # perception, alignment, IK, contact, time; "error" where the process itself broke.
+    # perception, alignment, IK, contact, time; BROKEN where the process itself broke.
     cause: str = ""
     reason: str = ""
     # Predicted against the expert's pose (m, rad), None where nothing was predicted.
@@ -101,28 +106,61 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     return low, high
 
 
+# Runs `iga` in a process that ends with the one that started it: when its standard input is closed.
+_LEASHED = """
+import os, sys, threading
+threading.Thread(target=lambda: (os.read(0, 1), os._exit(9)), daemon=True).start()
+from iga_drake.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+_TEMPORARY = "iga_trial_"
+_LEASHES: set[int] = set()  # file descriptors that keep the processes of trials alive
+
+
 def run_trial(trial: Trial, *, timeout: float = 1800.0) -> TrialResult:
-    """Runs one episode in a process of its own; a broken process is a failed trial."""
-    with tempfile.TemporaryDirectory(prefix="iga_trial_") as folder:
+    """Runs one episode in a process of its own; a broken process is a failed trial of the cause
+    "error". The process ends with this one."""
+    prefix = f"{_TEMPORARY}{os.getpid()}_"
+    with tempfile.TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True) as folder:
         path = Path(folder) / "result.json"
         command = [
-            sys.executable, "-m", "iga_drake.cli", "simulate", *trial.arguments,
+            sys.executable, "-c", _LEASHED, "simulate", *trial.arguments,
             "--seed", str(trial.seed), "--aligner", trial.aligner, "--split", trial.split,
             "--result", str(path),
         ]  # fmt: skip
         environment = os.environ | {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
+        leash, held = os.pipe()
+        _LEASHES.add(held)
         try:
             done = subprocess.run(
-                command, capture_output=True, text=True, timeout=timeout, env=environment
-            )
+                command, stdin=leash, capture_output=True, text=True, timeout=timeout,
+                env=environment,
+            )  # fmt: skip
             lines = done.stderr.strip().splitlines()
             reason = f"exit status {done.returncode}: {lines[-1] if lines else 'no message'}"
         except subprocess.TimeoutExpired:
             reason = f"no verdict within {timeout:g} s of wall-clock time"
+        finally:
+            os.close(leash)
+            _let_go(held)
         if path.is_file():
             return _result(trial, json.loads(path.read_text(encoding="utf-8")))
-    broken = {"task": trial.task, "success": False, "cause": "error", "reason": reason}
+    broken = {"task": trial.task, "success": False, "cause": BROKEN, "reason": reason}
     return _result(trial, broken)
+
+
+def _let_go(held: int) -> None:
+    if held in _LEASHES:
+        _LEASHES.discard(held)
+        os.close(held)
+
+
+def _remove_left() -> None:
+    """Removes temporary folders of processes that were ended."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_TEMPORARY}*_*"):
+        number = folder.name[len(_TEMPORARY) :].partition("_")[0]
+        if number.isdecimal() and not process_lives(int(number)):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 _MEASURED = (
@@ -150,8 +188,11 @@ def evaluate(
     """Runs trials, `processes` at a time; those that the store holds are taken from there.
 
     Each result is stored as soon as it is there, so an interrupted evaluation goes on where it
-    stopped.
+    stopped. Where the process itself broke nothing was measured, and nothing is stored. A
+    KeyboardInterrupt ends the processes of all trials.
     """
+    _remove_left()
+    ended = threading.Event()
 
     def one(trial: Trial) -> TrialResult:
         row = store.get(trial.whole_key) if store else None
@@ -159,13 +200,21 @@ def evaluate(
             result = _result(trial, row, reused=True)
         else:
             result = run(trial)
-            if store:
+            if ended.is_set():
+                return result  # of a process that was ended
+            if store and result.cause != BROKEN:
                 store.add(trial.whole_key, {n: getattr(result, n) for n in _MEASURED})
         on_result(result)
         return result
 
-    with ThreadPoolExecutor(max_workers=max(1, processes)) as executor:
+    executor = ThreadPoolExecutor(max_workers=max(1, processes))
+    try:
         return list(executor.map(one, trials))
+    finally:  # nothing is left to do but after an error or an interrupt
+        ended.set()
+        executor.shutdown(wait=False, cancel_futures=True)
+        for held in tuple(_LEASHES):
+            _let_go(held)
 
 
 def _median(values: Iterable[float | None]) -> float | None:

@@ -67,12 +67,13 @@ def voxelize(points: np.ndarray, voxel_size: float) -> VoxelGrid:
     inverse = np.float32(1.0 / voxel_size)
     # One empty layer around the bounding box: a neighbour is never outside of the tables.
     lower = np.floor(xyz.min(axis=1) * inverse) - 1
-    shape = (np.floor(xyz.max(axis=1) * inverse) + 1 - lower + 1).astype(np.int64)
-    if np.prod(shape.astype(float)) > _MOST_CELLS:
+    shape = np.floor(xyz.max(axis=1) * inverse) + 1 - lower + 1
+    if not np.prod(shape.astype(float)) <= _MOST_CELLS:
         raise VoxelError(
-            f"a cloud of {shape[0]} x {shape[1]} x {shape[2]} voxels of {voxel_size} m: crop it to "
-            "the work area or take larger voxels"
+            f"a cloud of {shape[0]:g} x {shape[1]:g} x {shape[2]:g} voxels of {voxel_size} m: "
+            "crop it to the work area or take larger voxels"
         )
+    shape = shape.astype(np.int64)
     strides = (int(shape[1] * shape[2]), int(shape[2]), 1)
     keys = np.zeros(xyz.shape[1], dtype=np.int32)
     for axis, stride in enumerate(strides):

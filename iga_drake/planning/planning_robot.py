@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import Frame
 from pydrake.planning import DofMask, JointLimits, SceneGraphCollisionChecker
 
-from iga_drake.errors import check_range
+from iga_drake.errors import check_bounds
 
 
 @dataclass
@@ -27,8 +27,16 @@ class PlanningConfig:
 
     def check(self, where: str = "planning") -> None:
         """Raises `ConfigError` for a value out of range."""
-        for name, value in vars(self).items():
-            check_range(value >= 0, f"{where}.{name}", value, ">= 0")
+        check_bounds(
+            self,
+            where,
+            {
+                "safety_distance": (0.0, 0.2),
+                "table_distance": (0.0, 0.2),
+                "position_margin": (0.0, 0.5),
+                "starts": (0, 500),
+            },
+        )
 
 
 @dataclass(frozen=True)

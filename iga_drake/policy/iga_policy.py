@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context, InputPort, LeafSystem, State
 
 from iga_drake.demonstrations.demonstration import ObservedRole
 from iga_drake.policy.machine import PolicyMachine, PolicyMemory
+from iga_drake.systems.fusion import CameraCounts
 from iga_drake.systems.messages import FollowerStatus, SupervisorStatus
 from iga_drake.systems.ports import PANDA_JOINTS
 
@@ -28,6 +29,7 @@ class IgaPolicy(LeafSystem):
         - target_cloud
         - grasped_cloud
         - camera_counts (optional)
+        - cloud_losses (optional)
         - pose_measured
         - panda.position_measured
         - follower.status
@@ -40,8 +42,8 @@ class IgaPolicy(LeafSystem):
         - energies
 
     - `target_cloud`, `grasped_cloud` (PointCloud, m in W): what the cameras see of each role.
-    - `camera_counts` (dict of camera name -> `CameraCounts`): a camera without valid pixels is
-      waited for.
+    - `camera_counts` (dict of camera name -> `CameraCounts`): a camera with a problem is waited
+      for. `cloud_losses` (dict of role -> words): where the pixels of a cloud got lost.
     - `pose_measured` (RigidTransform): X_WE. `panda.position_measured` (7, rad).
     - `target` (EndEffectorTarget): of sequence 0 while the arm has not been asked to move.
     - `status` (PolicyStatus): phase, timeline, reason.
@@ -59,6 +61,7 @@ class IgaPolicy(LeafSystem):
             "grasped": self.DeclareAbstractInputPort("grasped_cloud", cloud),
         }
         self._counts_input = self.DeclareAbstractInputPort("camera_counts", AbstractValue.Make({}))
+        self._losses_input = self.DeclareAbstractInputPort("cloud_losses", AbstractValue.Make({}))
         self._pose_input = self.DeclareAbstractInputPort("pose_measured", Value[RigidTransform]())
         self._position_input = self.DeclareVectorInputPort("panda.position_measured", PANDA_JOINTS)
         self._follower_input = self.DeclareAbstractInputPort(
@@ -122,15 +125,13 @@ class _Pull:
     def cloud(self, role: ObservedRole) -> np.ndarray:
         return self._read(self._policy._cloud_inputs[role]).xyzs().T.copy()
 
-    def silent_cameras(self) -> Mapping[str, str]:
+    def cameras(self) -> Mapping[str, CameraCounts]:
         port = self._policy._counts_input
-        if not port.HasValue(self._context):
-            return {}
-        return {
-            name: counts.problem or "delivered no depth: check the camera and its connection"
-            for name, counts in self._read(port).items()
-            if counts.valid == 0
-        }
+        return self._read(port) if port.HasValue(self._context) else {}
+
+    def losses(self, role: ObservedRole) -> str:
+        port = self._policy._losses_input
+        return self._read(port).get(role, "") if port.HasValue(self._context) else ""
 
     def pose(self) -> RigidTransform:
         return RigidTransform(self._read(self._policy._pose_input))

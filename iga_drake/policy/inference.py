@@ -24,26 +24,25 @@ import numpy as np
 from iga_drake.aligners.protocol import Aligner, PoseEstimate, check_aligns
 from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.errors import error_text
+from iga_drake.policy.motion import Refusal
 from iga_drake.systems.messages import Cause
 
 Contexts = Sequence[tuple[Alignment, ...]]
-_RIGID = 1e-6
 
 
 @dataclass(frozen=True)
 class InferenceAnswer:
-    """A pose estimate whose numbers are finite and whose poses are rigid."""
+    """A pose estimate and what it took."""
 
     estimate: PoseEstimate
     seconds: float  # wall-clock time that the aligner took
 
 
-class InferenceFailure(Exception):
+class InferenceFailure(Refusal):
     """There is no answer; the message is the reason."""
 
     def __init__(self, reason: str, cause: Cause = Cause.ALIGNMENT) -> None:
-        super().__init__(reason)
-        self.cause = cause
+        super().__init__(reason, cause)
 
 
 class Inference(Protocol):
@@ -81,24 +80,6 @@ class Inference(Protocol):
     def close(self) -> None:
         """Ends what runs. A later `start` begins anew."""
         ...
-
-
-def checked_answer(name: str, found: Any, seconds: float) -> InferenceAnswer:
-    """`found`, what an aligner returned, as an answer; `InferenceFailure` if it isn't one."""
-    try:
-        estimate = PoseEstimate(found.poses, found.energies, found.probabilities, found.familiarity)
-    except Exception as error:
-        raise InferenceFailure(
-            f"aligner {name}: returned {type(found).__name__}, a PoseEstimate is expected ({error})"
-        ) from error
-    numbers = (estimate.poses, estimate.energies, estimate.probabilities)
-    if not all(np.isfinite(array).all() for array in numbers):
-        raise InferenceFailure(f"aligner {name}: poses or energies are not finite")
-    R = estimate.poses[:, :3, :3]
-    off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max()
-    if off > _RIGID or (np.linalg.det(R) < 0).any() or (estimate.poses[:, 3] != [0, 0, 0, 1]).any():
-        raise InferenceFailure(f"aligner {name}: poses are not rigid transforms (off by {off:.2g})")
-    return InferenceAnswer(estimate, seconds)
 
 
 class LocalInference:
@@ -150,11 +131,10 @@ class LocalInference:
                     target_up=target_up,
                     seed=seed,
                 )
-                result = checked_answer(self.name, found, time.perf_counter() - began)
+                estimate = PoseEstimate.of(found)
+                result = InferenceAnswer(estimate, time.perf_counter() - began)
             except KeyboardInterrupt:
                 raise
-            except InferenceFailure as failure:
-                result = failure
             except BaseException as error:
                 result = InferenceFailure(f"aligner {self.name}: {error_text(error)}")
             if question == self._question:
@@ -281,7 +261,7 @@ class WorkerInference:
         self._pending = False
         if "error" in answer:
             raise InferenceFailure(f"aligner {self.name}: {answer['error']}")
-        return checked_answer(self.name, PoseEstimate(**answer["estimate"]), answer["seconds"])
+        return InferenceAnswer(PoseEstimate(**answer["estimate"]), answer["seconds"])
 
     def _death(self) -> str:
         """How the worker ended, in words."""

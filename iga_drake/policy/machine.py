@@ -21,8 +21,8 @@ from pydrake.math import RigidTransform
 
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.demonstrations.demonstration import DemonstrationSet, Observation, ObservedRole
-from iga_drake.errors import check_range
-from iga_drake.policy.inference import Inference, InferenceFailure
+from iga_drake.errors import check_bounds, check_range, error_text
+from iga_drake.policy.inference import Inference
 from iga_drake.policy.motion import (
     MotionStep,
     ObservationPlan,
@@ -33,15 +33,25 @@ from iga_drake.policy.motion import (
     ReachablePose,
     Refusal,
     TaskMotion,
+    Workspace,
     check_observation,
+    check_workspace,
     choose_reachable,
     motion_steps,
     moved_steps,
 )
+from iga_drake.systems.fusion import CameraCounts
 from iga_drake.systems.messages import Cause, EndEffectorTarget, FollowerStatus, SupervisorStatus
 
 INFERENCE_WAYS = ("lockstep", "delay", "concurrent")
 DOWN_W = np.array([0.0, 0.0, -1.0])
+# Kind of what goes wrong in a phase and doesn't say it itself.
+_CAUSES = {
+    Phase.OBSERVE: Cause.PERCEPTION,
+    Phase.PRESENT: Cause.IK,
+    Phase.INFER: Cause.ALIGNMENT,
+    Phase.MOVE: Cause.IK,
+}
 
 
 @dataclass(kw_only=True)
@@ -58,6 +68,8 @@ class PolicyConfig:
     observe_limit: float = 20.0
     # Fewest usable points of an observed cloud.
     minimum_points: int = 64
+    # Fewest cameras without a fault: with as many, the others are left out. null: all have to be.
+    minimum_cameras: int | None = None
     # Limit (s) of each way to where the hand shows its object to the cameras.
     present_limit: float = 20.0
     # Limit (s) of the motion around each waypoint.
@@ -79,16 +91,19 @@ class PolicyConfig:
 
     def check(self, where: str = "policy") -> None:
         """Raises `ConfigError` for a value out of range."""
-        for name in (
-            "period", "observe_retry", "observe_limit", "present_limit", "move_limit", "infer_limit"
-        ):  # fmt: skip
-            value = getattr(self, name)
-            check_range(value > 0, f"{where}.{name}", value, "> 0")
-        for name in ("observe_settle", "infer_delay", "minimum_points"):
-            value = getattr(self, name)
-            check_range(value >= 0, f"{where}.{name}", value, ">= 0")
-        least = self.minimum_familiarity
-        check_range(0 <= least <= 1, f"{where}.minimum_familiarity", least, "0..1")
+        bounds = {
+            "period": (1e-3, 1.0),
+            "observe_settle": (0.0, 60.0),
+            "observe_retry": (1e-3, 60.0),
+            "minimum_points": (0, 100_000),
+            "infer_delay": (0.0, 60.0),
+            "minimum_familiarity": (0.0, 1.0),
+        }
+        for name in ("observe_limit", "present_limit", "move_limit", "infer_limit"):
+            bounds[name] = (1e-9, 3600.0)
+        if self.minimum_cameras is not None:
+            bounds["minimum_cameras"] = (1, 64)
+        check_bounds(self, where, bounds)
         ways = ", ".join(INFERENCE_WAYS)
         check_range(self.inference in INFERENCE_WAYS, f"{where}.inference", self.inference, ways)
 
@@ -100,8 +115,13 @@ class PolicyInputs(Protocol):
         """The fused camera cloud (P, 3) (m, in W) of the objects with this role."""
         ...
 
-    def silent_cameras(self) -> Mapping[str, str]:
-        """Name of each camera that delivered nothing usable -> why, in words."""
+    def cameras(self) -> Mapping[str, CameraCounts]:
+        """What was made of the images of each camera; empty where nothing counts."""
+        ...
+
+    def losses(self, role: ObservedRole) -> str:
+        """Where the pixels of the objects with this role got lost on the way to their cloud, in
+        words; empty where that isn't known."""
         ...
 
     def pose(self) -> RigidTransform:
@@ -153,6 +173,9 @@ class PolicyMemory:
         return self
 
 
+_Step = Callable[[PolicyMemory, PolicyInputs, float], PolicyMemory]
+
+
 class PolicyMachine:
     """Observe, infer, move, over any number of waypoints.
 
@@ -162,6 +185,8 @@ class PolicyMachine:
         demonstrations: of the same waypoints; None takes the hand's openings from `motion`.
         gripper: opening (m) of the hand -> (P, 3) cloud of the gripper in E.
         solve: inverse kinematics, `solve(X_WE, q_near) -> (7,) rad or None`.
+        workspace: corners (3,) (m, in W), lower and upper, of the box in which E has to stay: poses
+            outside are refused.
         seed: given to the aligner.
     """
 
@@ -174,6 +199,7 @@ class PolicyMachine:
         gripper: Callable[[float], np.ndarray],
         solve: Callable[[RigidTransform, np.ndarray], np.ndarray | None],
         config: PolicyConfig | None = None,
+        workspace: Workspace | None = None,
         seed: int = 0,
     ) -> None:
         if demonstrations is not None:
@@ -191,6 +217,7 @@ class PolicyMachine:
         self._gripper = gripper
         self._solve = solve
         self._seed = seed
+        self._workspace = workspace
 
     def start(self) -> PolicyMemory:
         """The memory before the first tick: the arm stays, the hand keeps its approach opening."""
@@ -213,16 +240,44 @@ class PolicyMachine:
         )
 
     def advance(self, memory: PolicyMemory, inputs: PolicyInputs, now: float) -> PolicyMemory:
-        """The memory after one tick at simulated time `now` (s)."""
-        phase = memory.status.phase
-        if phase.final:
+        """The memory after one tick at simulated time `now` (s).
+
+        Whatever goes wrong in it, in the inputs or in the aligner, ends the task with the reason,
+        the arm held; nothing is raised but a `KeyboardInterrupt`.
+        """
+        if memory.status.phase.final:
             return memory
+        cause = _CAUSES[memory.status.phase]
+        memory = self._guarded(self._step, cause, memory, inputs, now)
+        if memory.status.phase is Phase.INFER and len(memory.estimates) > len(memory.chosen):
+            memory = self._guarded(self._choose, Cause.IK, memory, inputs, now)
+        return memory
+
+    def _guarded(
+        self, step: _Step, cause: Cause, memory: PolicyMemory, inputs: PolicyInputs, now: float
+    ) -> PolicyMemory:
+        """The memory after `step`, or, where it raised something, after giving up: for the cause
+        that a `Refusal` names, or for `cause`."""
+        try:
+            return step(memory, inputs, now)
+        except KeyboardInterrupt:
+            raise
+        except Refusal as refusal:
+            reason, cause = str(refusal), refusal.cause
+        except BaseException as fault:
+            reason = error_text(fault)
+        self.inference.cancel()
+        if memory.status.phase in (Phase.OBSERVE, Phase.INFER):
+            return self._refuse(memory, now, reason, cause)
+        return self._fail(memory, inputs, now, reason, cause)
+
+    def _step(self, memory: PolicyMemory, inputs: PolicyInputs, now: float) -> PolicyMemory:
         supervisor = inputs.supervisor()
         if supervisor.holding:
             self.inference.cancel()
             cause = supervisor.cause or Cause.IK
             return self._fail(memory, inputs, now, f"supervisor: {supervisor.reason}", cause)
-        match phase:
+        match memory.status.phase:
             case Phase.OBSERVE:
                 return self._observe(memory, inputs, now)
             case Phase.PRESENT:
@@ -303,27 +358,42 @@ class PolicyMachine:
         if now < memory.observe_next:
             return memory
         try:
-            silent = inputs.silent_cameras()
-            if silent:
-                raise Refusal("; ".join(f"{name} {why}" for name, why in silent.items()))
+            self._check_cameras(inputs.cameras())
             points = check_observation(
-                inputs.cloud(plan.role), plan.name, minimum=self.config.minimum_points
+                inputs.cloud(plan.role),
+                plan.name,
+                minimum=self.config.minimum_points,
+                why=lambda: inputs.losses(plan.role),
             )
         except Refusal as refusal:
             again = now + self.config.observe_retry
             if again - memory.phase_started > self.config.observe_limit:
-                return self._refuse(memory, now, str(refusal), Cause.PERCEPTION)
-            return replace(memory, observe_next=again)
+                raise
+            status = replace(memory.status, waits_for=str(refusal))
+            return replace(memory, observe_next=again, status=status)
         if plan.frame == "E":
             # The arm is at rest: the measured pose belongs to this very image.
             points = (inputs.pose().inverse() @ points.T).T
         memory = self._note(memory, inputs, now, plan, points)
         return self._continue(memory, inputs, now, f"{plan.name} {len(points)} points")
 
+    def _check_cameras(self, cameras: Mapping[str, CameraCounts]) -> None:
+        """Raises `Refusal` where a camera is wrong that may not be left out."""
+        wrong = {name: counts.problem for name, counts in cameras.items() if counts.problem}
+        least = self.config.minimum_cameras
+        good = len(cameras) - len(wrong)
+        if wrong and (least is None or good < least):
+            reason = "; ".join(f"{name} {why}" for name, why in wrong.items())
+            if least is not None:
+                reason += f" ({good} of {len(cameras)} cameras are left, {least} are needed)"
+            raise Refusal(reason, Cause.PERCEPTION)
+
     def _start_present(
         self, memory: PolicyMemory, plan: ObservationPlan, now: float, detail: str
     ) -> PolicyMemory:
         assert plan.present is not None
+        if reason := check_workspace(plan.present, self._workspace):
+            raise Refusal(f"the pose that shows '{plan.name}' {reason}", Cause.IK)
         opening = memory.target.opening_reached
         step = MotionStep(
             name=f"present {plan.name}",
@@ -347,8 +417,8 @@ class PolicyMachine:
 
     def _infer(self, memory: PolicyMemory, inputs: PolicyInputs, now: float) -> PolicyMemory:
         index, config = len(memory.estimates), self.config
-        waypoint = self.motion.waypoints[index]
         if memory.question is None:
+            waypoint = self.motion.waypoints[index]
             grasped, target = (
                 memory.observations[name] for name in (waypoint.grasped, waypoint.target)
             )
@@ -369,40 +439,42 @@ class PolicyMachine:
         )
         if config.inference == "delay" and not waits:
             return memory
-        try:
-            answer = self.inference.poll(memory.question, left if waits else 0.0)
-        except InferenceFailure as failure:
-            return self._refuse(memory, now, str(failure), failure.cause)
+        answer = self.inference.poll(memory.question, left if waits else 0.0)
         seconds = wall.perf_counter() - memory.asked if answer is None else answer.seconds
         if seconds >= config.infer_limit or (answer is None and waits):
-            self.inference.cancel()
-            reason = (
+            raise Refusal(
                 f"aligner {self.inference.name}: no answer after {seconds:.1f} s, the limit is "
-                f"{config.infer_limit:g} s"
+                f"{config.infer_limit:g} s",
+                Cause.TIME,
             )
-            return self._refuse(memory, now, reason, Cause.TIME)
         if answer is None:
             return memory
-        estimate = answer.estimate
         status = replace(
             memory.status, inference_seconds=(*memory.status.inference_seconds, seconds)
         )
-        memory = replace(
-            memory, estimates=(*memory.estimates, estimate), status=status, question=None
-        )
+        estimates = (*memory.estimates, answer.estimate)
+        return replace(memory, estimates=estimates, status=status, question=None)
+
+    def _choose(self, memory: PolicyMemory, inputs: PolicyInputs, now: float) -> PolicyMemory:
+        """Settles on a pose of the last estimate."""
+        config, index = self.config, len(memory.estimates) - 1
+        estimate, seconds = memory.estimates[index], memory.status.inference_seconds[index]
         familiarity, least = estimate.familiarity, config.minimum_familiarity
         if familiarity is not None and not familiarity >= least:
-            reason = (
+            raise Refusal(
                 f"aligner {self.inference.name}: these objects look like none of the "
                 f"demonstrations (familiarity {familiarity:.2f}, {least:g} is asked for): "
-                "demonstrate the task with such objects, or ask for less"
+                "demonstrate the task with such objects, or ask for less",
+                Cause.ALIGNMENT,
             )
-            return self._refuse(memory, now, reason, Cause.ALIGNMENT)
-        near = memory.chosen[-1].posture if memory.chosen else inputs.position()
-        try:
-            chosen = choose_reachable(estimate, waypoint, near=near, solve=self._solve)
-        except Refusal as refusal:
-            return self._refuse(memory, now, str(refusal), Cause.IK)
+        chosen = choose_reachable(
+            estimate,
+            self.motion.waypoints[index],
+            near=memory.chosen[-1].posture if memory.chosen else inputs.position(),
+            solve=self._solve,
+            workspace=self._workspace,
+            limit=config.infer_limit - seconds,
+        )
         memory = replace(memory, chosen=(*memory.chosen, chosen))
         detail = (
             f"mode {chosen.mode + 1} of {len(estimate.poses)}, energy {chosen.energy:.3f}, "
@@ -472,6 +544,7 @@ class PolicyMachine:
             memory.status,
             phase=phase,
             step=memory.steps[memory.step].name if moves else "",
+            waits_for="",
             timeline=(*memory.status.timeline, entry),
         )
         return replace(memory, status=status, phase_started=now)
@@ -491,9 +564,12 @@ class PolicyMachine:
         status = memory.status
         during = status.step or f"{status.phase.value} {status.subject}".strip()
         opening = memory.target.opening_moving
+        X_WE = inputs.pose()
+        if not np.isfinite(X_WE.GetAsMatrix34()).all():  # then the supervisor holds the arm
+            X_WE = memory.target.X_WE
         hold = EndEffectorTarget(
             sequence=memory.target.sequence + 1,
-            X_WE=inputs.pose(),
+            X_WE=X_WE,
             opening_moving=opening,
             opening_reached=opening,
         )

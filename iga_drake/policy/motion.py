@@ -3,6 +3,8 @@
 Everything here is a plain function or a frozen value, so that it can be tested without a diagram.
 """
 
+import math
+import time as wall
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -22,6 +24,10 @@ class PolicyError(IgaDrakeError):
 
 class Refusal(IgaDrakeError):
     """The policy will not act on what it was given; the message is the reason to show."""
+
+    def __init__(self, reason: str, cause: Cause) -> None:
+        super().__init__(reason)
+        self.cause = cause
 
 
 class Phase(Enum):
@@ -68,6 +74,8 @@ class PolicyStatus:
     reason: str = ""
     # Kind of the refusal or failure; None otherwise.
     cause: Cause | None = None
+    # Why what was seen can't be used, while the policy waits to look again; empty otherwise.
+    waits_for: str = ""
     # Name of the motion step under way; empty while nothing moves.
     step: str = ""
     # Measured X_WE at each waypoint reached so far, before the hand acted there.
@@ -242,21 +250,52 @@ def moved_steps(
     )
 
 
-def check_observation(points: np.ndarray, name: str, *, minimum: int) -> np.ndarray:
-    """`points` (P, 3) without invalid ones, or a `Refusal` that says what the cameras delivered."""
-    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+def check_observation(
+    points: np.ndarray, name: str, *, minimum: int, why: Callable[[], str] = lambda: ""
+) -> np.ndarray:
+    """`points` (P, 3) without invalid ones, or a `Refusal` that says what the cameras delivered;
+    `why` knows where the rest got lost, in words."""
+    try:
+        points = np.asarray(points, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise Refusal(
+            f"the cloud of '{name}' is {type(points).__name__}, points (P, 3) expected",
+            Cause.PERCEPTION,
+        ) from error
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise Refusal(
+            f"the cloud of '{name}' has the shape {points.shape}, (P, 3) expected", Cause.PERCEPTION
+        )
     finite = points[np.isfinite(points).all(axis=1)]
-    if len(points) == 0:
-        raise Refusal(
-            f"the cloud of '{name}' is empty: no camera sees it; move it into the work area"
-        )
-    if len(finite) < minimum:
+    if len(finite) >= minimum:
+        return finite
+    text = f"the cloud of '{name}' is empty"
+    if len(points):
         bad = len(points) - len(finite)
-        raise Refusal(
+        text = (
             f"the cloud of '{name}' has {len(finite)} usable points ({bad} are NaN or infinite), "
-            f"at least {minimum} are needed: is it in view of the cameras?"
+            f"at least {minimum} are needed"
         )
-    return finite
+    reason = why() or "no camera sees it; move it into the work area"
+    raise Refusal(f"{text}: {reason}", Cause.PERCEPTION)
+
+
+Workspace = tuple[np.ndarray, np.ndarray]  # corners (3,), lower and upper (m, in W)
+# Distance (m) that poses keep from the workspace's borders: the arm isn't exact.
+_WORKSPACE_MARGIN = 0.002
+
+
+def check_workspace(X_WE: RigidTransform, workspace: Workspace | None) -> str:
+    """Says which coordinate of a pose isn't inside the workspace; empty if all are."""
+    if workspace is None:
+        return ""
+    for axis, value, low, high in zip("xyz", X_WE.translation(), *workspace, strict=True):
+        if not low + _WORKSPACE_MARGIN <= value <= high - _WORKSPACE_MARGIN:
+            return (
+                f"lies outside the workspace: {axis} = {value:.3f} m, allowed: {low:g} to "
+                f"{high:g} m"
+            )
+    return ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,22 +315,55 @@ def choose_reachable(
     *,
     near: np.ndarray,
     solve: Callable[[RigidTransform, np.ndarray], np.ndarray | None],
+    workspace: Workspace | None = None,
+    limit: float = math.inf,
 ) -> ReachablePose:
     """The mode of lowest energy whose poses before, at and after the waypoint are all reachable.
 
     Among the symmetries of that mode the one whose posture is closest to `near` (7,) (rad) is
-    taken. `solve(X_WE, q_near)` returns joint angles or None. Raises `Refusal` if none can be
-    reached.
+    taken. `solve(X_WE, q_near)` returns joint angles or None; it isn't asked for poses outside the
+    `workspace`. Raises `Refusal` if none can be reached, or if that isn't settled within `limit`
+    (s, wall clock).
     """
+    began = wall.perf_counter()
+    outside = ""
+
+    def solved(X_WE: RigidTransform, q_near: np.ndarray) -> np.ndarray | None:
+        check_time()
+        q = solve(X_WE, q_near)
+        if q is not None and not np.isfinite(q).all():
+            raise Refusal(f"inverse kinematics: joint angles {q} are not finite", Cause.IK)
+        return q
+
+    def check_time() -> None:
+        seconds = wall.perf_counter() - began
+        if seconds >= limit:
+            raise Refusal(
+                f"no reachable pose after {seconds:.1f} s of inverse kinematics, {limit:.1f} s "
+                "were left of the limit",
+                Cause.TIME,
+            )
+
     for mode, (matrix, energy) in enumerate(zip(estimate.poses, estimate.energies, strict=True)):
         found: list[tuple[float, ReachablePose]] = []
         for symmetry, X_EE in enumerate(motion.symmetries_E):
+            check_time()
             X_WE = RigidTransform(matrix) @ X_EE
-            before = solve(offset_pose(X_WE, motion.before_E, motion.before_W), near)
-            at = None if before is None else solve(X_WE, before)
+            X_WBefore = offset_pose(X_WE, motion.before_E, motion.before_W)
+            X_WAfter = offset_pose(X_WE, motion.after_E, motion.after_W)
+            reasons = [
+                f"the pose {name} {motion.name} {reason}"
+                for name, X in (("before", X_WBefore), ("at", X_WE), ("after", X_WAfter))
+                if (reason := check_workspace(X, workspace))
+            ]
+            if reasons:
+                outside = outside or reasons[0]
+                continue
+            before = solved(X_WBefore, near)
+            at = None if before is None else solved(X_WE, before)
             if before is None or at is None:
                 continue
-            if solve(offset_pose(X_WE, motion.after_E, motion.after_W), at) is None:
+            if solved(X_WAfter, at) is None:
                 continue
             distance = float(np.linalg.norm(before - near) + np.linalg.norm(at - before))
             pose = ReachablePose(
@@ -301,7 +373,8 @@ def choose_reachable(
         if found:
             return min(found, key=lambda item: item[0])[1]
     p = np.round(estimate.poses[0, :3, 3], 3).tolist()
-    raise Refusal(
+    reason = (
         f"none of {len(estimate.poses)} poses x {len(motion.symmetries_E)} symmetries is reachable "
         f"(best at {p} m): place the objects closer to the middle of the work area"
     )
+    raise Refusal(f"{outside}; {reason}" if outside else reason, Cause.IK)

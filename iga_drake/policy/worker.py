@@ -6,15 +6,15 @@ one message a question; each is answered with an estimate or with an error. What
 goes to the standard error stream. The process ends when its pipe is closed.
 """
 
+import contextlib
 import os
+import signal
 import sys
 import threading
 import time
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from typing import Any
-
-import numpy as np
 
 from iga_drake.errors import error_text
 
@@ -32,14 +32,20 @@ def _receive(connection: Connection, messages: "SimpleQueue[dict[str, Any]]") ->
 
 def main(descriptor: int) -> None:
     """Serves the questions that come through the pipe with this file descriptor."""
-    connection = Connection(descriptor)
-    os.nice(_NICENESS)
+    # Who interrupts is meant to interrupt the process that asks, and that one ends this.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Libraries print to the descriptor, not to Python's stream.
+    with contextlib.suppress(OSError):  # there may be no such streams
+        os.dup2(2, 1)
     sys.stdout = sys.stderr
+    os.nice(_NICENESS)
+    connection = Connection(descriptor)
     messages: SimpleQueue[dict[str, Any]] = SimpleQueue()
     threading.Thread(target=_receive, args=(connection, messages), daemon=True).start()
     first = messages.get()
     aligner, contexts, failed = None, [], ""
     try:
+        from iga_drake.aligners.protocol import PoseEstimate
         from iga_drake.aligners.registry import make_aligner
         from iga_drake.demonstrations.alignment import Alignment
 
@@ -55,7 +61,7 @@ def main(descriptor: int) -> None:
         if aligner is not None:
             began = time.perf_counter()
             try:
-                estimate = aligner.align(
+                found = aligner.align(
                     contexts[asked["waypoint"]],
                     asked["grasped"],
                     asked["target"],
@@ -63,16 +69,9 @@ def main(descriptor: int) -> None:
                     target_up=asked["target_up"],
                     seed=asked["seed"],
                 )
-                familiarity = estimate.familiarity
-                answer = {
-                    "estimate": {
-                        "poses": np.asarray(estimate.poses),
-                        "energies": np.asarray(estimate.energies),
-                        "probabilities": np.asarray(estimate.probabilities),
-                        "familiarity": None if familiarity is None else float(familiarity),
-                    },
-                    "seconds": time.perf_counter() - began,
-                }
+                # Plain arrays, whatever the aligner's own types are.
+                answer = {"estimate": vars(PoseEstimate.of(found))}
+                answer["seconds"] = time.perf_counter() - began
             except Exception as error:
                 answer = {"error": error_text(error)}
         connection.send(answer)

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from iga_drake.checkpoint import CheckpointError, load_checkpoint
+from iga_drake.checkpoint import load_network, sizes_in_card
 
 KIND = "dif-net"  # of checkpoints
 
@@ -187,14 +187,11 @@ class DifNet(nn.Module):
 
 def load_dif_net(path: Path) -> tuple[DifNet, dict]:
     """The trained fields (evaluation mode) and their card; raises `CheckpointError`."""
-    tensors, card = load_checkpoint(path, kind=KIND)
-    try:
-        net = DifNet(DifNetConfig(**card["model"]), len(tensors["latents"]))
-        net.load_state_dict(tensors)
-    except (KeyError, TypeError, RuntimeError) as error:
-        raise CheckpointError(
-            f"{path}: card and tensors don't describe this release's network ({error}): train one "
-            "with `iga train dif-net` or name another"
-        ) from error
-    net.eval().requires_grad_(False)
-    return net, card
+    return load_network(
+        path,
+        kind=KIND,
+        build=lambda card, tensors: DifNet(
+            sizes_in_card(DifNetConfig, card["model"]), len(tensors["latents"])
+        ),
+        remedy="train one with `iga train dif-net` or name another",
+    )

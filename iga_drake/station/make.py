@@ -8,6 +8,7 @@ point of the group `iga_drake.stations`. The function takes a scenario, and as k
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram
 
+from iga_drake.errors import error_text
 from iga_drake.registry import Registry
 from iga_drake.station.contract import StationError, check_port_contract
 from iga_drake.station.scenario import Scenario
@@ -40,6 +41,12 @@ def make_station(
 
     Raises `StationError` for an unknown name, for what can't be built, and for a broken contract.
     """
-    station = _REGISTRY.factory(scenario.station)(scenario, scene=scene, seed=seed, meshcat=meshcat)
+    factory = _REGISTRY.factory(scenario.station)
+    try:
+        station = factory(scenario, scene=scene, seed=seed, meshcat=meshcat)
+    except (RuntimeError, SystemExit) as error:  # Drake raises both
+        raise StationError(
+            f"station '{scenario.station}': can't be built: {error_text(error)}"
+        ) from error
     check_port_contract(station, scenario.camera_names)
     return station

@@ -20,7 +20,7 @@ import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load, yaml_load_typed
 from pydrake.multibody.plant import MultibodyPlantConfig
 
-from iga_drake.errors import IgaDrakeError, check_range
+from iga_drake.errors import IgaDrakeError, check_bounds, check_range, error_text, shortened
 from iga_drake.paths import diagrams_dir
 from iga_drake.planning.planning_robot import PlanningConfig
 from iga_drake.policy.machine import PolicyConfig
@@ -37,6 +37,9 @@ from iga_drake.viewing.meshcat import Visualization
 
 class ScenarioError(IgaDrakeError):
     """A scenario file is missing, is no YAML, or says something that the schema does not allow."""
+
+
+_LARGEST_FILE = 1_000_000  # bytes
 
 
 def _plant() -> MultibodyPlantConfig:
@@ -65,8 +68,8 @@ class Table:
         for name, length in (("size", 3), ("center", 2), ("color", 3)):
             value = getattr(self, name)
             check_range(len(value) == length, f"{where}.{name}", value, f"{length} numbers")
-        check_range(min(self.size) > 0, f"{where}.size", self.size, "3 numbers > 0")
-        check_range(self.friction >= 0, f"{where}.friction", self.friction, ">= 0")
+        bounds = {"size": (1e-3, 10.0), "center": (-2.0, 2.0), "friction": (0.0, 10.0)}
+        check_bounds(self, where, bounds | {"color": (0.0, 1.0)})
 
 
 @dataclass
@@ -85,8 +88,7 @@ class Panda:
         """Raises `ConfigError` for a value out of range."""
         looks = ("auto", "meshes", "primitives")
         check_range(self.visuals in looks, f"{where}.visuals", self.visuals, ", ".join(looks))
-        for name in ("time_constant", "opening_speed"):
-            check_range(getattr(self, name) > 0, f"{where}.{name}", getattr(self, name), "> 0")
+        check_bounds(self, where, {"time_constant": (1e-4, 10.0), "opening_speed": (1e-3, 1.0)})
 
 
 def _cameras() -> dict[str, RgbdCamera]:
@@ -204,26 +206,38 @@ def load_scenario(
     for file in (path, *overlays):
         file = scenario_path(file)
         try:
-            text = file.read_text(encoding="utf-8")
+            size = file.stat().st_size
+            text = file.read_text(encoding="utf-8") if size <= _LARGEST_FILE else ""
         except (OSError, UnicodeDecodeError) as e:
             raise ScenarioError(
                 f"{file}: scenario can't be read ({e}): give the path of a .yaml"
             ) from e
+        if size > _LARGEST_FILE:
+            raise ScenarioError(
+                f"{file}: {size} bytes, a scenario has at most {_LARGEST_FILE}: is it another file?"
+            )
         scenario = _layered(scenario, text, str(file))
     for override in overrides:
-        scenario = _layered(scenario, _override_text(override, scenario), override, keep_maps=True)
+        text = _override_text(override, scenario)
+        scenario = _layered(scenario, text, _cut(override), keep_maps=True)
     return scenario
 
 
 def scenario_path(name: str | Path) -> Path:
     """`name` as a path, or as the name of a file in `diagrams/`, with or without ".yaml"."""
     path = Path(name)
+    try:
+        path.is_file()
+    except (OSError, ValueError) as e:  # too long, a null character
+        raise ScenarioError(f"scenario {_cut(str(name))}: no path ({error_text(e)})") from e
     named = diagrams_dir() / f"{path.name.removesuffix('.yaml')}.yaml"
     if not path.is_file() and path.name == str(name) and named.is_file():
         return named
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in diagrams_dir().glob("*.yaml")))
-        raise ScenarioError(f"scenario {name}: no such file; name a YAML file or one of: {known}")
+        raise ScenarioError(
+            f"scenario {_cut(str(name))}: no such file; name a YAML file or one of: {known}"
+        )
     return path
 
 
@@ -237,7 +251,7 @@ def _override_text(override: str, scenario: Scenario) -> str:
     names = key.strip().split(".")
     if not found or not all(names):
         raise ScenarioError(
-            f"{override}: expected key.path=value, such as control.linear_speed=0.1"
+            f"{_cut(override)}: expected key.path=value, such as control.linear_speed=0.1"
         )
     text = ""
     now: Any = scenario
@@ -262,12 +276,14 @@ def _layered(scenario: Scenario, text: str, where: str, *, keep_maps: bool = Fal
     added to."""
     try:
         node = yaml.compose(text, Loader=yaml.SafeLoader)
-        _check_keys(node, "")
+        _check_keys(node, "", set())
         data = None if node is None else yaml_load(data=text, private=True)
     except yaml.YAMLError as e:
-        raise ScenarioError(f"{where}: not valid YAML: {e}") from e
+        raise ScenarioError(f"{where}: not valid YAML: {error_text(e)}") from e
     except ScenarioError as e:
         raise ScenarioError(f"{where}: {e}") from None
+    except Exception as e:  # values that Python can't make, nesting too deep
+        raise ScenarioError(f"{where}: can't be read: {error_text(e)}") from e
     if data is None:
         return scenario
     try:
@@ -279,12 +295,18 @@ def _layered(scenario: Scenario, text: str, where: str, *, keep_maps: bool = Fal
     except IgaDrakeError as e:
         raise ScenarioError(f"{where}: {e}") from None
     except Exception as e:  # yaml_load_typed raises many kinds
-        raise ScenarioError(f"{where}: {e}") from e
+        raise ScenarioError(f"{where}: {error_text(e)}") from e
     return layered
 
 
-def _check_keys(node: yaml.Node | None, where: str) -> None:
-    """Raises `ScenarioError` where a mapping states a key twice: YAML itself takes the last."""
+def _check_keys(node: yaml.Node | None, where: str, seen: set[int]) -> None:
+    """Raises `ScenarioError` where a mapping states a key twice: YAML itself takes the last.
+
+    Nodes that were `seen`, by their ids, are left out: aliases make many of a few.
+    """
+    if id(node) in seen:
+        return
+    seen.add(id(node))
     if isinstance(node, yaml.MappingNode):
         lines: dict[str, int] = {}
         for key, value in node.value:
@@ -292,14 +314,14 @@ def _check_keys(node: yaml.Node | None, where: str) -> None:
             line = key.start_mark.line + 1
             if name in lines:
                 raise ScenarioError(
-                    f"key '{f'{where}.{name}' if where else name}' is stated twice, in lines "
+                    f"key '{_cut(f'{where}.{name}' if where else name)}' is stated twice, in lines "
                     f"{lines[name]} and {line}: remove one"
                 )
             lines[name] = line
-            _check_keys(value, f"{where}.{name}" if where else name)
+            _check_keys(value, f"{where}.{name}" if where else name, seen)
     elif isinstance(node, yaml.SequenceNode):
         for i, item in enumerate(node.value):
-            _check_keys(item, f"{where}[{i}]")
+            _check_keys(item, f"{where}[{i}]", seen)
 
 
 def _fields(schema: type) -> dict[str, typing.Any] | None:
@@ -327,7 +349,7 @@ def _check_node(schema: typing.Any, node: typing.Any, where: str) -> None:
         tag = node.get("_tag", f"!{choices[0].__name__}") if isinstance(node, dict) else None
         if tag is not None and tag[1:] not in structs:
             valid = ", ".join(f"!{c}" for c in structs)
-            raise ScenarioError(f"{name}: unknown tag {tag}; valid tags: {valid}")
+            raise ScenarioError(f"{name}: unknown tag {_cut(tag)}; valid tags: {valid}")
         return _check_node(structs[tag[1:]] if tag else choices[0], node, where)
     fields = _fields(schema)
     if fields is not None or origin is dict:
@@ -338,7 +360,7 @@ def _check_node(schema: typing.Any, node: typing.Any, where: str) -> None:
                 continue
             if not isinstance(key, str) or (fields is not None and key not in fields):
                 valid = ", ".join(fields) if fields is not None else "any text"
-                raise ScenarioError(f"unknown key '{key}' in {name}; valid keys: {valid}")
+                raise ScenarioError(f"unknown key '{_cut(key)}' in {name}; valid keys: {valid}")
             child = fields[key] if fields is not None else arguments[1]
             _check_node(child, value, f"{where}.{key}" if where else key)
     elif origin is list:
@@ -364,10 +386,24 @@ def _accepts(schema: type, node: typing.Any) -> bool:
 
 
 def _wrong_type(where: str, expected: str, node: typing.Any) -> ScenarioError:
-    return ScenarioError(f"{where}: expected {expected}, found {type(node).__name__} {node!r}")
+    kind = type(node).__name__
+    return ScenarioError(f"{_cut(where)}: expected {expected}, found {kind} {shortened(node)}")
 
 
-# Drake itself looks at these names only when the plant is built.
+def _cut(key: object) -> str:
+    """A key that may be anything, in few characters."""
+    text = key if isinstance(key, str) else shortened(key)
+    return text if len(text) <= 80 else f"{text[:60]}..."
+
+
+# Drake itself looks at these values only when the plant is built.
+_MOST_SEED = 2**31 - 1
+_PLANT_BOUNDS = {
+    "time_step": (1e-5, 0.02),
+    "penetration_allowance": (1e-6, 0.1),
+    "stiction_tolerance": (1e-6, 1.0),
+    "sap_near_rigid_threshold": (0.0, 100.0),
+}
 _PLANT_CHOICES = {
     "contact_model": ("point", "hydroelastic", "hydroelastic_with_fallback"),
     "discrete_contact_approximation": ("tamsi", "sap", "similar", "lagged"),
@@ -377,13 +413,16 @@ _PLANT_CHOICES = {
 
 def _check_values(s: Scenario) -> None:
     """Raises `ConfigError` for ranges and lengths; types are right already."""
-    check_range(s.plant.time_step > 0, "plant.time_step", s.plant.time_step, "> 0")
+    check_bounds(s.plant, "plant", _PLANT_BOUNDS)
     for key, valid in _PLANT_CHOICES.items():
         value = getattr(s.plant, key)
         check_range(value in valid, f"plant.{key}", value, ", ".join(valid))
     s.panda.check("panda")
     s.table.check("table")
-    check_range(len(s.cameras) > 0, "cameras", s.cameras, "at least one camera")
+    check_range(0 < len(s.cameras) <= 32, "cameras", list(s.cameras), "1 to 32 cameras")
+    for name in s.cameras:
+        good = 0 < len(name) <= 64 and name.isprintable()
+        check_range(good, "cameras", name, "names of 1 to 64 printable characters")
     for name, camera in s.cameras.items():
         camera.check(f"cameras.{name}")
     s.clutter.check("clutter")
@@ -394,7 +433,6 @@ def _check_values(s: Scenario) -> None:
     s.supervisor.check(PANDA_JOINTS, "supervisor")
     s.policy.check("policy")
     s.visualization.check("visualization")
-    check_range(s.task.time_limit > 0, "task.time_limit", s.task.time_limit, "> 0")
-    check_range(s.context_size > 0, "context_size", s.context_size, "> 0")
-    for name, seed in vars(s.seeds).items():
-        check_range(seed >= 0, f"seeds.{name}", seed, ">= 0")
+    check_bounds(s.task, "task", {"time_limit": (1e-3, 86_400.0)})
+    check_range(1 <= s.context_size <= 1000, "context_size", s.context_size, "1 to 1000")
+    check_bounds(s.seeds, "seeds", dict.fromkeys(vars(s.seeds), (0, _MOST_SEED)))

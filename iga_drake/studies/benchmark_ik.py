@@ -27,6 +27,8 @@ _TIME_LIMIT = 20.0  # simulated s for one pose
 # Quicker than the scenario's: limits are more likely to be met.
 _CONTROL = WaypointFollowerConfig(period=0.005, linear_speed=0.25, angular_speed=math.radians(90))
 
+_MOST_POSES = 1000  # tried for one that can be reached
+
 
 @dataclass(frozen=True)
 class IkBenchmark:
@@ -104,9 +106,10 @@ def random_reachable_pose(
     """A random pose X_WE in front of the robot and joint angles (rad) that reach it.
 
     E lies in a box of 0.4 m x 0.8 m x 0.5 m above the table; it points down, tilted by up to 60
-    degrees to any side, at any angle about its own axis.
+    degrees to any side, at any angle about its own axis. Raises `IgaDrakeError` where none can be
+    reached.
     """
-    while True:
+    for _ in range(_MOST_POSES):
         p_WE = random.uniform([0.3, -0.4, 0.02], [0.7, 0.4, 0.52])
         tilt, side, turn = random.uniform([0, -np.pi, -np.pi], [np.pi / 3, np.pi, np.pi])
         R_WE = (
@@ -119,6 +122,7 @@ def random_reachable_pose(
         q = solver.solve(X_WE, near=near)
         if q is not None:
             return q, X_WE
+    raise IgaDrakeError(f"{_MOST_POSES} random poses in a row can't be reached from {near}")
 
 
 def benchmark_ik(count: int = 1000, seed: int = 0, json: bool = False) -> IkBenchmark:

@@ -6,6 +6,7 @@ best of the returned modes, a descent of the energy from the truth, the oracle.
 """
 
 import argparse
+import itertools
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from iga_drake.aligners.iga.aligner import Explanation, IgaAligner
@@ -32,11 +34,14 @@ from iga_drake.dataset.samples import Sample, make_sample
 from iga_drake.dataset.splits import sample_set
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.alignment import COLUMNS, EVALUATION_SETS, FLIP, Errors
+from iga_drake.geometry.rigid_fit import rigid_fit
 from iga_drake.geometry.se3 import geodesic_angle, kabsch, rigid, so3_exp, transform
 from iga_drake.training.correspondence import DescriptorTraining
 
 WRONG = np.radians(FLIP)  # a coarse hypothesis further off than this is wrong
 TERCILES = ("least", "middle", "most")
+# Bounds of the probabilities of the best mode that are compared with how often it is no flip.
+CLAIMS = (0.0, 0.7, 0.9, 0.97, 1.0)
 LOWER = 1e-3  # an energy counts as lower than another where it is by this much
 # About which axis of which object an answer is turned by half, the longest axis first.
 TURNED = (
@@ -124,6 +129,8 @@ class Diagnosis:
     categories: tuple[str, str]  # of A and B
     # How the found pose is turned as a whole (`turned_about`), "" where it isn't.
     flip: str
+    probability: float  # of the found pose, as the aligner states it
+    contrast: float  # of a flip (`contrast`); of other answers the least of the half-turns'
 
 
 def true_logits(sample: Sample, index: Tensor, sigma: float) -> Tensor:
@@ -219,20 +226,64 @@ def turned_about(sample: Sample, motion: np.ndarray) -> str:
     right = nearest_valid(motion, equivalents(sample, symmetry=True), cloud)
     if pose_errors(motion, right, cloud)[1] <= WRONG:
         return ""
+    turned = _half_turned(sample, right)
+    nearest = nearest_valid(motion, turned, cloud)
+    if pose_errors(motion, nearest, cloud)[1] > WRONG:
+        return TURNED[-1]
+    return TURNED[int((turned == nearest).all((1, 2)).argmax())]
+
+
+def _half_turned(sample: Sample, right: np.ndarray) -> np.ndarray:
+    """(6, 4, 4): a right motion of the test pair's A with A, then with B, turned by half about each
+    of its principal axes, the longest first."""
     answers = []
     for role in range(2):
         points = sample.surface[role, :, 0].astype(np.float64)
-        axes = np.linalg.eigh(np.cov(points.T))[1].T[::-1]  # the longest first
+        axes = np.linalg.eigh(np.cov(points.T))[1].T[::-1]
         turns = np.tile(np.eye(4), (3, 1, 1))
         turns[:, :3, :3] = 2 * axes[:, :, None] * axes[:, None] - np.eye(3)
         centre = points.mean(0)
         turns[:, :3, 3] = centre - turns[:, :3, :3] @ centre
         answers.append(right @ turns if role == 0 else turns @ right)
-    turned = np.concatenate(answers)
-    nearest = nearest_valid(motion, turned, cloud)
-    if pose_errors(motion, nearest, cloud)[1] > WRONG:
-        return TURNED[-1]
-    return TURNED[int((turned == nearest).all((1, 2)).argmax())]
+    return np.concatenate(answers)
+
+
+def contrast(sample: Sample, motion: np.ndarray) -> float:
+    """How much a motion (4, 4) of the test pair's A in W could be seen to be turned, compared with
+    the nearest right one: the distance of the test cloud from itself, turned about its centroid as
+    the motion turns it, over the mean distance between it and the demonstrations' clouds of the
+    object in true alignment, the smaller one of A's and B's.
+
+    Near 1 and below, the turned object is as like the demonstrated ones as the right one. A
+    distance is the mean one to the nearest neighbour, of half the points among the other half.
+    """
+    right = nearest_valid(motion, equivalents(sample, symmetry=True), sample.points[0, -1])
+    rotation = right[:3, :3].T @ motion[:3, :3], motion[:3, :3] @ right[:3, :3].T
+    return min(_self_distance(sample, role, rotation[role]) for role in range(2))
+
+
+def _self_distance(sample: Sample, role: int, rotation: np.ndarray) -> float:
+    """`contrast` of one object turned by a rotation (3, 3)."""
+    aligned = []
+    for n in range(sample.points.shape[1]):
+        points, first = np.unique(sample.points[role, n], axis=0, return_index=True)
+        place = sample.canonical[role, n, first] * sample.size[role, n]
+        lot = np.random.default_rng(n).permutation(len(points))
+        R, p = rigid_fit(points[lot], place[lot])
+        aligned.append(points[lot] @ R.T + p)
+    test = aligned[-1]
+    # The fits above turn all clouds into the canonical frame.
+    R, _ = rigid_fit(sample.points[role, -1], sample.canonical[role, -1] * sample.size[role, -1])
+    middle = test.mean(0)
+    turned = (test - middle) @ (R @ rotation @ R.T).T + middle
+    return _distance(turned, test) / float(np.mean([_distance(a, test) for a in aligned[:-1]]))
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean distance (m) to the nearest neighbour, of every other point of a cloud (P, 3) among the
+    others of a cloud (Q, 3), and back."""
+    a, b = a[::2], b[1::2]
+    return float((cKDTree(b).query(a)[0].mean() + cKDTree(a).query(b)[0].mean()) / 2)
 
 
 def step_from(X: Tensor, centre: Tensor, step: Tensor) -> Tensor:
@@ -297,6 +348,10 @@ def diagnose_sample(aligner: IgaAligner, split: str, index: int) -> Diagnosis:
     oracle = oracle_pose(sample)
     if oracle is not None:
         errors["oracle"] = problem.error(oracle @ np.linalg.inv(problem.query.start))
+    motion = found @ problem.query.start
+    flip = turned_about(sample, motion)
+    right = nearest_valid(motion, equivalents(sample, symmetry=True), sample.points[0, -1])
+    turned = [motion] if flip else _half_turned(sample, right)
     return Diagnosis(
         split=split,
         index=index,
@@ -316,7 +371,9 @@ def diagnose_sample(aligner: IgaAligner, split: str, index: int) -> Diagnosis:
             for d in range(len(problem.query.context))
         ),
         categories=sample.category,
-        flip=turned_about(sample, found @ problem.query.start),
+        flip=flip,
+        probability=float(explanation.estimate.probabilities[0]),
+        contrast=min(contrast(sample, X) for X in turned),
     )
 
 
@@ -376,6 +433,10 @@ class Summary:
     # Of answers turned as a whole: by category (samples with it, flips), and by TURNED.
     flips_by_category: dict[str, tuple[int, int]]
     flips_by_axis: dict[str, int]
+    # Of flips and of other answers: `Diagnosis.contrast`, sorted.
+    contrast: tuple[tuple[float, ...], tuple[float, ...]]
+    # Between two CLAIMS each: number of answers, mean probability claimed, share that is no flip.
+    calibration: tuple[tuple[int, float, float], ...]
     # For each of TERCILES: least and greatest deformation, errors of the found pose.
     deformation: tuple[tuple[float, float, Errors], ...]
 
@@ -399,6 +460,17 @@ class Summary:
         ):
             if names:
                 lines.append("  " + "; ".join(f"{name}: {k}" for name, k in names.items()))
+        for name, values in zip(("flips", "half-turns of the others"), self.contrast, strict=True):
+            if values:
+                like = sum(value <= 1 for value in values)
+                lines.append(
+                    f"contrast of {name}: median {np.median(values):.2f}; {like} of {len(values)} "
+                    "at most 1, where the turned object is as like the demonstrated ones"
+                )
+        lines.append(
+            "probability claimed, and share that is no flip: "
+            + "; ".join(f"{100 * p:.0f} % {100 * q:.0f} % ({n})" for n, p, q in self.calibration)
+        )
         lines += [
             f"energy of the found pose below the truth's: {100 * self.below_truth:.0f} % of the "
             f"samples, median difference {self.gap_median:.2f}",
@@ -461,8 +533,24 @@ def summarise_diagnoses(rows: Iterable[Diagnosis]) -> Summary:
         flips_by_axis={
             name: count for name in TURNED if (count := sum(row.flip == name for row in rows))
         },
+        contrast=(
+            tuple(sorted(row.contrast for row in rows if row.flip)),
+            tuple(sorted(row.contrast for row in rows if not row.flip)),
+        ),
+        calibration=_calibration(rows),
         deformation=tuple(terciles),
     )
+
+
+def _calibration(rows: Sequence[Diagnosis]) -> tuple[tuple[int, float, float], ...]:
+    """See `Summary.calibration`."""
+    table = []
+    for low, high in itertools.pairwise(CLAIMS):
+        some = [r for r in rows if low < r.probability <= high]
+        if some:
+            claimed = float(np.mean([r.probability for r in some]))
+            table.append((len(some), claimed, float(np.mean([not r.flip for r in some]))))
+    return tuple(table)
 
 
 def _flips_by_category(rows: Sequence[Diagnosis]) -> dict[str, tuple[int, int]]:

@@ -12,7 +12,7 @@ from pydrake.planning import DofMask, JointLimits
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import AffineSystem, BusCreator, MatrixGain
 
-from iga_drake.errors import check_range
+from iga_drake.errors import check_bounds, check_range
 from iga_drake.planning.planning_robot import PlanningRobot
 
 _System = DifferentialInverseKinematicsSystem
@@ -43,16 +43,31 @@ class DifferentialIkConfig:
 
     def check(self, period: float, where: str = "differential_ik") -> None:
         """Raises `ConfigError` for a value out of range; `period` (s) is that of the commands."""
-        for name, value in vars(self).items():
-            check_range(value > 0, f"{where}.{name}", value, "> 0")
-        scale = self.velocity_scale
-        check_range(scale <= 1, f"{where}.velocity_scale", scale, "above 0, at most 1")
+        check_bounds(
+            self,
+            where,
+            {
+                "horizon": (1e-3, 1.0),
+                "angular_velocity": (1e-3, 10.0),
+                "linear_velocity": (1e-3, 5.0),
+                "velocity_scale": (1e-3, 1.0),
+                "position_margin": (1e-4, 0.5),
+                "position_influence": (1e-4, 1.0),
+                "collision_influence": (1e-4, 0.5),
+                "posture_gain": (1e-3, 1000.0),
+                "pose_weight": (1e-3, 1e6),
+            },
+        )
+        margin, influence = self.position_margin, self.position_influence
+        above = f"above position_margin, {margin:g} rad"
+        check_range(influence > margin, f"{where}.position_influence", influence, above)
         least = f"at least the period of the commands, {period:g} s"
         check_range(self.horizon >= period, f"{where}.horizon", self.horizon, least)
 
 
 class JointIntegrator(LeafSystem):
-    """Integrates joint velocities from where the joints are measured at the first update on.
+    """Integrates joint velocities from where the joints are measured at the first update on that
+    finds them finite.
 
     .. pydrake_system::
 
@@ -86,8 +101,10 @@ class JointIntegrator(LeafSystem):
         return position if np.isfinite(position).all() else self._measured_input.Eval(context)
 
     def _update(self, context: Context, values: Any) -> None:
-        step = self._period * self._velocity_input.Eval(context)
-        values.set_value(self._state, self._position(context) + step)
+        position = self._position(context)
+        if np.isfinite(position).all():  # no velocity follows from what isn't
+            step = self._period * self._velocity_input.Eval(context)
+            values.set_value(self._state, position + step)
 
     def _calc_position(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._position(context))

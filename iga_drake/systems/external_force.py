@@ -26,7 +26,7 @@ class ExternalForce(LeafSystem):
     - `position` (N, rad), `torque_external` (N, N m): of the arm's joints.
     - `force` (3, N in W): the force part of the wrench F at E of least norm with torque = J^T F. It
       is the sum of all forces on hand and held object if nothing else touches the arm; a moment is
-      told apart from it. A held object's weight is part of it.
+      told apart from it. A held object's weight is part of it. NaN where an input isn't finite.
 
     Computed where it is asked for, once per time.
     """
@@ -47,12 +47,13 @@ class ExternalForce(LeafSystem):
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
         robot, plant = self._robot, self._robot.checker.plant()
-        plant_context = robot.checker.UpdatePositions(
-            robot.full(self._position_input.Eval(context))
-        )
+        position, torque = self._position_input.Eval(context), self._torque_input.Eval(context)
+        if not (np.isfinite(position).all() and np.isfinite(torque).all()):
+            output.SetFromVector(np.full(3, np.nan))
+            return
+        plant_context = robot.checker.UpdatePositions(robot.full(position))
         world = plant.world_frame()
         jacobian = plant.CalcJacobianSpatialVelocity(
             plant_context, JacobianWrtVariable.kV, robot.frame_E, np.zeros(3), world, world
         )[:, robot.indices]
-        torque = self._torque_input.Eval(context)
         output.SetFromVector((np.linalg.pinv(jacobian.T, rcond=_SINGULAR) @ torque)[3:])

@@ -1,5 +1,6 @@
 """Forward kinematics: measured joint angles become the measured end-effector pose."""
 
+import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem
@@ -19,7 +20,7 @@ class ForwardKinematics(LeafSystem):
         - pose
 
     - `position` (N, rad): angles of the arm's joints.
-    - `pose` (RigidTransform): X_WE.
+    - `pose` (RigidTransform): X_WE; its translation is NaN where an angle isn't finite.
     """
 
     def __init__(self, robot: PlanningRobot) -> None:
@@ -35,4 +36,8 @@ class ForwardKinematics(LeafSystem):
         )
 
     def _calc_pose(self, context: Context, output: AbstractValue) -> None:
-        output.set_value(self._robot.pose(self._position_input.Eval(context)))
+        position = self._position_input.Eval(context)
+        finite = np.isfinite(position).all()
+        output.set_value(
+            self._robot.pose(position) if finite else RigidTransform(np.full(3, np.nan))
+        )

@@ -12,9 +12,13 @@ from pydrake.systems.framework import Context, LeafSystem, ValueProducer
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I
 from scipy.ndimage import binary_dilation
 
-from iga_drake.errors import IgaDrakeError, check_range
-from iga_drake.geometry.voxels import voxel_cloud
+from iga_drake.errors import IgaDrakeError, check_bounds, check_range, shortened
+from iga_drake.geometry.voxels import voxelize
 from iga_drake.systems.ports import Role
+
+# Depths (m) that a camera in a robot's cell can measure.
+_NEAREST, _FARTHEST = 0.01, 20.0
+_RIGID = 1e-4
 
 
 class FusionError(IgaDrakeError):
@@ -36,14 +40,27 @@ class FusionConfig:
     depth_jump: float = 0.02
     # Connected groups of fewer voxels than this are dropped, >= 1 (1: none is dropped).
     min_cluster: int = 8
-    # An image older than this counts as none (s).
+    # An image older than this, or newer than now by as much, counts as none (s).
     maximum_age: float = 0.5
+    # A camera that measures a depth in less than this share of its pixels counts as none.
+    minimum_valid: float = 0.005
 
     def check(self, where: str = "fusion") -> None:
         """Raises `ConfigError` for a value out of range."""
-        for name in ("voxel_size", "depth_jump", "min_cluster", "maximum_age"):
-            check_range(getattr(self, name) > 0, f"{where}.{name}", getattr(self, name), "> 0")
-        check_range(self.erosion >= 0, f"{where}.erosion", self.erosion, ">= 0")
+        check_bounds(
+            self,
+            where,
+            {
+                "voxel_size": (5e-4, 0.1),
+                "crop_lower": (-10.0, 10.0),
+                "crop_upper": (-10.0, 10.0),
+                "erosion": (0, 50),
+                "depth_jump": (1e-4, 10.0),
+                "min_cluster": (1, 100_000),
+                "maximum_age": (1e-3, 3600.0),
+                "minimum_valid": (1e-6, 1.0),
+            },
+        )
         lower, upper = self.crop_lower, self.crop_upper
         ordered = len(lower) == len(upper) == 3 and all(
             low < up for low, up in zip(lower, upper, strict=True)
@@ -53,12 +70,12 @@ class FusionConfig:
 
 @dataclass(frozen=True)
 class CameraCounts:
-    """Pixel counts of one camera's images; `valid` = 0 means that it delivered nothing."""
+    """Pixel counts of one camera's images."""
 
     valid: int  # pixels with a depth
     target: int  # pixels used for the target's cloud, before the voxel filter
     grasped: int  # pixels used for the grasped object's cloud, before the voxel filter
-    # Why none of its pixels was used, in words to follow the camera's name; empty if some were.
+    # Why none of its pixels was used, in words to follow the camera's name; empty if some may be.
     problem: str = ""
 
 
@@ -69,6 +86,71 @@ class FusedClouds:
     target: np.ndarray
     grasped: np.ndarray
     counts: dict[str, CameraCounts]
+    # "target", "grasped" -> where most of the pixels labelled so got lost, in words.
+    losses: dict[str, str]
+
+
+@dataclass
+class _Left:
+    """How many pixels of one role are left after each step of the fusion, of all cameras."""
+
+    labelled: int = 0
+    measured: int = 0
+    sound: int = 0
+    inside: int = 0
+    voxels: int = 0
+    kept: int = 0
+    # Bounds (2, 3) (m, in W) of what was not inside.
+    outside: np.ndarray | None = None
+
+    def add(self, role: int, label: np.ndarray, valid: np.ndarray, good: np.ndarray) -> None:
+        mine = label == role
+        self.labelled += int(np.count_nonzero(mine))
+        self.measured += int(np.count_nonzero(mine & valid))
+        self.sound += int(np.count_nonzero(mine & good))
+
+    def crop(self, points: np.ndarray, inside: np.ndarray) -> None:
+        """`points` (3, P) in W and which of them are inside the box (P,)."""
+        self.inside += int(np.count_nonzero(inside))
+        if not inside.all():
+            lost = points[:, ~inside]
+            bounds = np.stack([lost.min(axis=1), lost.max(axis=1)])
+            if self.outside is not None:
+                bounds = np.stack(
+                    [np.fmin(bounds[0], self.outside[0]), np.fmax(bounds[1], self.outside[1])]
+                )
+            self.outside = bounds
+
+    def words(self, name: str, config: FusionConfig) -> str:
+        """Where most of them got lost."""
+        if self.labelled == 0:
+            return f"no camera has pixels labelled '{name}': is it in view and segmented?"
+        steps = (
+            (self.labelled, self.measured, "pixels", "have no depth"),
+            (self.measured, self.sound, "pixels", f"lie within {config.erosion} px of a jump in "
+             "depth or label: it is seen too small, or fusion.depth_jump is too low"),
+            (self.sound, self.inside, "pixels", self._cropped(config)),
+            # Ten pixels in a voxel are nothing special.
+            (self.inside, min(self.inside, 10 * self.voxels), "pixels", "fall into "
+             f"{self.voxels} voxels: fusion.voxel_size is {config.voxel_size:g} m"),
+            (self.voxels, self.kept, "voxels", "lie in groups of fewer than fusion.min_cluster = "
+             f"{config.min_cluster}"),
+        )  # fmt: skip
+        before, after, unit, text = min(steps, key=lambda step: step[1] / step[0] if step[0] else 2)
+        if after > before / 2:
+            return f"only {self.labelled} pixels are labelled '{name}': is it in full view?"
+        lost = before if "voxels:" in text else before - after
+        return f"{lost} of {before} {unit} labelled '{name}' {text}"
+
+    def _cropped(self, config: FusionConfig) -> str:
+        box = f"{list(config.crop_lower)} to {list(config.crop_upper)} m"
+        if self.outside is None:
+            return f"lie outside fusion.crop_lower to crop_upper, {box}"
+        low, high = np.round(self.outside.astype(float), 2).tolist()
+        return (
+            f"lie outside fusion.crop_lower to crop_upper, {box}, at {low} to {high} m: is it in "
+            "the work area, and are the cameras' poses right?"
+        )
 
 
 def unreliable_pixels(
@@ -96,8 +178,10 @@ class PointCloudFusion(LeafSystem):
 
     Pixels without a depth (0, NaN, infinite), near jumps in depth or label, and points outside the
     crop box are dropped; the rest is unprojected into W, averaged by voxel, and specks are removed.
-    An image that is too old is no image. All outputs come from one cached calculation and are pure
-    functions of the inputs and of the time.
+    Each camera is looked at by itself, and one with a problem gives no points: no image, an old one
+    or one of the future, images of another size than the intrinsics', nearly no depth, depth in
+    other units, labels that are no roles, a pose that isn't rigid. All outputs come from one cached
+    calculation and are pure functions of the inputs and of the time.
 
     .. pydrake_system::
 
@@ -111,6 +195,7 @@ class PointCloudFusion(LeafSystem):
         - target_cloud
         - grasped_cloud
         - camera_counts
+        - cloud_losses
 
     - `<camera>.depth_image` (m), `<camera>.label_image` (roles), `<camera>.pose` (X_WC of the
       optical frame), `<camera>.time` (s, when the images were taken): as in the port contract, for
@@ -118,6 +203,8 @@ class PointCloudFusion(LeafSystem):
     - `target_cloud`, `grasped_cloud`: `PointCloud` with float32 xyz in W (m); empty if nothing is
       seen.
     - `camera_counts`: dict of camera name -> `CameraCounts`.
+    - `cloud_losses`: dict of "target", "grasped" -> where most of the pixels labelled so got lost,
+      in words.
     """
 
     def __init__(self, cameras: Mapping[str, CameraInfo], config: FusionConfig | None = None):
@@ -153,68 +240,121 @@ class PointCloudFusion(LeafSystem):
         self.DeclareAbstractOutputPort(
             "camera_counts", lambda: AbstractValue.Make({}), self._calc_counts
         )
+        self.DeclareAbstractOutputPort(
+            "cloud_losses", lambda: AbstractValue.Make({}), self._calc_losses
+        )
 
     def _calc_fused(self, context, value) -> None:
         parts: dict[int, list[np.ndarray]] = {Role.TARGET: [], Role.GRASPED: []}
+        left = {role: _Left() for role in parts}
         counts = {}
         for name, ports in self._inputs.items():
-            problem = self._find_problem(name, context)
+            depth, label, X_WC = (port.Eval(context) for port in ports)
+            depth, label = depth.data[:, :, 0], label.data[:, :, 0]
+            valid = (depth >= _NEAREST) & (depth <= _FARTHEST)
+            problem = (
+                self._time_problem(name, context)
+                or self._image_problem(name, depth, label, valid)
+                or _pose_problem(X_WC)
+            )
             if problem:
                 counts[name] = CameraCounts(0, 0, 0, problem)
                 continue
-            depth, label, X_WC = (port.Eval(context) for port in ports)
-            points, labels, valid = self._unproject(name, depth.data, label.data, X_WC)
+            points, labels = self._unproject(name, depth, label, valid, X_WC, left)
             number = {}
             for role, clouds in parts.items():
                 mine = labels == role
                 clouds.append(points if mine.all() else points.compress(mine, axis=1))
                 number[role] = clouds[-1].shape[1]
-            counts[name] = CameraCounts(valid, number[Role.TARGET], number[Role.GRASPED])
-        target, grasped = (
-            voxel_cloud(
-                np.hstack(parts[role] or [np.zeros((3, 0), np.float32)]).T,
-                self._config.voxel_size,
-                self._config.min_cluster,
+            counts[name] = CameraCounts(
+                int(np.count_nonzero(valid)), number[Role.TARGET], number[Role.GRASPED]
             )
-            for role in (Role.TARGET, Role.GRASPED)
-        )
-        value.set_value(FusedClouds(target, grasped, counts))
+        config, fused, losses = self._config, {}, {}
+        for role, name in ((Role.TARGET, "target"), (Role.GRASPED, "grasped")):
+            points = np.hstack(parts[role] or [np.zeros((3, 0), np.float32)]).T
+            fused[name] = np.zeros((0, 3), np.float32)
+            if len(points):
+                grid = voxelize(points, config.voxel_size)
+                fused[name] = grid.centroids[~grid.specks(config.min_cluster)]
+                left[role].voxels, left[role].kept = len(grid.centroids), len(fused[name])
+            losses[name] = left[role].words(name, config)
+        value.set_value(FusedClouds(**fused, counts=counts, losses=losses))
 
-    def _find_problem(self, name: str, context: Context) -> str:
-        """The reason, in words, why this camera's images can't be used; empty if they can."""
+    def _time_problem(self, name: str, context: Context) -> str:
+        """Why this camera's images can't be of now, in words; empty if they can."""
         port = self._times[name]
         if not port.HasValue(context):
             return ""
         taken = float(port.Eval(context)[0])
-        age = context.get_time() - taken
+        age, limit = context.get_time() - taken, self._config.maximum_age
         if not math.isfinite(taken):
             return "has delivered no image yet: check the camera and its connection"
-        if age > self._config.maximum_age:
+        if age > limit:
             return (
-                f"delivered its last image {age:.1f} s ago, at most {self._config.maximum_age:g} s "
-                "are allowed: check the camera and its connection"
+                f"delivered its last image {age:.1f} s ago, at most {limit:g} s are allowed: check "
+                "the camera and its connection"
+            )
+        if age < -limit:
+            return (
+                f"says that its image was taken {-age:.1f} s from now: its time has to be in s on "
+                "the diagram's clock"
             )
         return ""
 
-    def _unproject(
-        self, name: str, depth: np.ndarray, label: np.ndarray, X_WC: RigidTransform
-    ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Points (3, P) in W and labels (P,) of one camera's good pixels; its valid pixels."""
-        rays = self._rays[name]
-        depth, label = depth[:, :, 0], label[:, :, 0]
+    def _image_problem(
+        self, name: str, depth: np.ndarray, label: np.ndarray, valid: np.ndarray
+    ) -> str:
+        """Why images (H, W) can't be used, in words; empty if they can. `valid` (H, W) says which
+        pixels have a depth."""
+        shape = self._rays[name][0].shape
         for kind, image in (("depth_image", depth), ("label_image", label)):
-            if image.shape != rays[0].shape:
-                raise FusionError(
-                    f"{name}.{kind}: {image.shape[1]} x {image.shape[0]} px, the camera's "
-                    f"intrinsics say {rays[0].shape[1]} x {rays[0].shape[0]} px"
+            if image.shape != shape:
+                return (
+                    f"delivers a {kind} of {image.shape[1]} x {image.shape[0]} px, the scenario's "
+                    f"intrinsics say {shape[1]} x {shape[0]} px"
                 )
-        valid = (depth > 0) & (depth < np.inf)
+        if label.size and (label.min() < min(Role) or label.max() > max(Role)):
+            strange = sorted(set(np.unique(label).tolist()) - set(Role))
+            roles = ", ".join(f"{int(role)} {role.name.lower()}" for role in Role)
+            return f"delivers labels {shortened(strange)} that are no roles ({roles})"
+        share = np.count_nonzero(valid) / depth.size
+        if share >= self._config.minimum_valid:
+            return ""
+        far = depth[(depth > _FARTHEST) & (depth < np.inf)]
+        if len(far) >= self._config.minimum_valid * depth.size:
+            return (
+                f"delivers depths of {np.median(far):.4g} (median), m up to {_FARTHEST:g} are "
+                "expected: are they in mm?"
+            )
+        near = depth[(depth > 0) & (depth < _NEAREST)]
+        if len(near) >= self._config.minimum_valid * depth.size:
+            return (
+                f"delivers depths of {np.median(near):.4g} (median), m from {_NEAREST:g} on are "
+                "expected: were they scaled twice?"
+            )
+        if share == 0:
+            return "delivered no depth: check the camera and its connection"
+        return (
+            f"delivered a depth in {100 * share:.2g} % of its pixels, at least "
+            f"{100 * self._config.minimum_valid:g} % are needed: is it covered or dazzled?"
+        )
+
+    def _unproject(
+        self,
+        name: str,
+        depth: np.ndarray,
+        label: np.ndarray,
+        valid: np.ndarray,
+        X_WC: RigidTransform,
+        left: Mapping[int, _Left],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Points (3, P) in W and labels (P,) of one camera's good pixels; counts what is left."""
+        rays = self._rays[name]
         wanted = (label == Role.TARGET) | (label == Role.GRASPED)
         rows = np.flatnonzero(wanted.any(axis=1))
         columns = np.flatnonzero(wanted.any(axis=0))
-        number = int(np.count_nonzero(valid))
         if len(rows) == 0:
-            return np.zeros((3, 0), np.float32), np.zeros(0, np.int16), number
+            return np.zeros((3, 0), np.float32), np.zeros(0, np.int16)
         # Only the part of the image that holds the objects, with a margin for the borders.
         margin = self._config.erosion + 1
         part = tuple(
@@ -227,6 +367,8 @@ class PointCloudFusion(LeafSystem):
         good &= ~unreliable_pixels(
             z, label, jump=self._config.depth_jump, erosion=self._config.erosion
         )
+        for role, counted in left.items():
+            counted.add(role, label, valid, good)
         # Coordinate by coordinate: contiguous arrays, several times as fast as (P, 3) ones.
         z, label = z[good], label[good]
         x, y = (ray[part][good] * z for ray in rays)
@@ -237,7 +379,10 @@ class PointCloudFusion(LeafSystem):
         for axis in range(3):
             p_W[axis] = R[axis, 0] * x + R[axis, 1] * y + R[axis, 2] * z + p[axis]
             inside &= (p_W[axis] >= self._lower[axis]) & (p_W[axis] <= self._upper[axis])
-        return p_W.compress(inside, axis=1), label[inside], number
+        for role, counted in left.items():
+            mine = label == role
+            counted.crop(p_W[:, mine], inside[mine])
+        return p_W.compress(inside, axis=1), label[inside]
 
     def _cloud_output(self, name: str):
         def calc(context, output) -> None:
@@ -250,6 +395,23 @@ class PointCloudFusion(LeafSystem):
 
     def _calc_counts(self, context, output) -> None:
         output.set_value(dict(self._fused.Eval(context).counts))
+
+    def _calc_losses(self, context, output) -> None:
+        output.set_value(dict(self._fused.Eval(context).losses))
+
+
+def _pose_problem(X_WC: RigidTransform) -> str:
+    """Why a camera's pose is none, in words; empty if it is one."""
+    R = X_WC.rotation().matrix()
+    if not (np.isfinite(R).all() and np.isfinite(X_WC.translation()).all()):
+        return "has a pose that isn't finite: calibrate it, or check who publishes its pose"
+    off = np.abs(R @ R.T - np.eye(3)).max()
+    if off > _RIGID or np.linalg.det(R) < 0:
+        return (
+            f"has a pose whose rotation is no rotation matrix (off by {off:.2g}): it has to be "
+            "orthonormal with determinant 1"
+        )
+    return ""
 
 
 def pixel_rays(info: CameraInfo) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
-from iga_drake.errors import check_range
+from iga_drake.errors import check_bounds, check_range
 from iga_drake.planning.planning_robot import PlanningRobot
 from iga_drake.systems.messages import Cause, SupervisorStatus
 
@@ -30,18 +30,26 @@ class SupervisorConfig:
 
     def check(self, joints: int, where: str = "supervisor") -> None:
         """Raises `ConfigError` for a value out of range; the robot has this many joints."""
-        scale = self.velocity_scale
-        check_range(0 < scale <= 1, f"{where}.velocity_scale", scale, "above 0, at most 1")
-        for name in ("tracking_error", "torque_time"):
-            check_range(getattr(self, name) > 0, f"{where}.{name}", getattr(self, name), "> 0")
+        check_bounds(
+            self,
+            where,
+            {
+                "velocity_scale": (1e-3, 1.0),
+                "tracking_error": (1e-3, 3.2),
+                "workspace_lower": (-3.0, 3.0),
+                "workspace_upper": (-3.0, 3.0),
+                "torque_limit": (1e-3, 1000.0),
+                "torque_time": (1e-3, 60.0),
+            },
+        )
         lower, upper = self.workspace_lower, self.workspace_upper
         ordered = len(lower) == len(upper) == 3 and all(
             low < up for low, up in zip(lower, upper, strict=True)
         )
         check_range(ordered, f"{where}.workspace_lower", lower, f"3 numbers below {upper}")
         torque = self.torque_limit
-        fits = len(torque) == joints and min(torque) > 0
-        check_range(fits, f"{where}.torque_limit", torque, f"{joints} numbers > 0, one a joint")
+        one_each = len(torque) == joints
+        check_range(one_each, f"{where}.torque_limit", torque, f"{joints} numbers, one a joint")
 
 
 @dataclass(frozen=True)
@@ -124,7 +132,7 @@ class Supervisor(LeafSystem):
         command = np.array(self._commanded_input.Eval(context))
         torque = self._torque_input.Eval(context)
         overloaded = None
-        if (np.abs(torque) > self._config.torque_limit).any():
+        if not (np.abs(torque) <= self._config.torque_limit).all():
             overloaded = memory.time_overloaded
             overloaded = context.get_time() if overloaded is None else overloaded
         last = self._first_position(context) if memory.position is None else memory.position
@@ -157,10 +165,10 @@ class Supervisor(LeafSystem):
         the commanded motion. The reason is empty if nothing is wrong."""
         config, limits = self._config, self._limits
         for name, value in (
-            ("position_commanded", command),
             ("position_measured", position),
             ("velocity_measured", velocity),
             ("torque_external", torque),
+            ("position_commanded", command),
         ):
             if not np.isfinite(value).all():
                 return Cause.IK, f"{name} isn't finite: {value}"
@@ -213,7 +221,7 @@ class Supervisor(LeafSystem):
 
 def _outside(name: str, unit: str, value: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> str:
     """Says which joint's `value` is outside of its bounds; empty if none is."""
-    bad = np.flatnonzero((value < lower) | (value > upper))
+    bad = np.flatnonzero(~((value >= lower) & (value <= upper)))
     if len(bad) == 0:
         return ""
     joint = int(bad[0])

@@ -8,7 +8,7 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
-from iga_drake.errors import IgaDrakeError, check_range
+from iga_drake.errors import IgaDrakeError, check_bounds
 from iga_drake.planning.inverse_kinematics import PoseSolver
 from iga_drake.planning.routes import LinePath, Path, plan_path, pose_error
 from iga_drake.systems.messages import NO_TARGET, EndEffectorTarget, FollowerStatus
@@ -36,8 +36,18 @@ class WaypointFollowerConfig:
 
     def check(self, where: str = "control") -> None:
         """Raises `ConfigError` for a value out of range."""
-        for name, value in vars(self).items():
-            check_range(math.isfinite(value) and value > 0, f"{where}.{name}", value, "> 0")
+        check_bounds(
+            self,
+            where,
+            {
+                "period": (1e-3, 0.1),
+                "linear_speed": (1e-3, 2.0),
+                "angular_speed": (1e-3, 5.0),
+                "ramp": (1e-3, 10.0),
+                "position_tolerance": (1e-5, 0.1),
+                "rotation_tolerance": (1e-4, 1.0),
+            },
+        )
 
 
 @dataclass(frozen=True)
@@ -98,7 +108,7 @@ class WaypointFollower(LeafSystem):
       pose against the present target. A target out of reach is never reported; whoever sent it has
       to stop waiting.
 
-    All outputs are state, updated each time step.
+    All outputs are state, updated each time step; they stay where a measurement isn't finite.
     """
 
     def __init__(
@@ -142,8 +152,11 @@ class WaypointFollower(LeafSystem):
     def _update(self, context: Context, state: State) -> EventStatus:
         motion: _Motion = context.get_abstract_state(int(self._motion)).get_value()
         X_WE = RigidTransform(self._pose_input.Eval(context))  # a copy: Eval refers to the cache
+        measured = self._position_input.Eval(context)
+        if not (np.isfinite(X_WE.GetAsMatrix34()).all() and np.isfinite(measured).all()):
+            return EventStatus.DidNothing()  # stays; the supervisor holds the arm
         if motion.home is None:
-            motion = replace(motion, home=self._position_input.Eval(context).copy())
+            motion = replace(motion, home=measured.copy())
         target = self._target_input.Eval(context)
         desired = motion.X_WDesired or X_WE
         if target.sequence > 0 and (
@@ -209,7 +222,7 @@ class WaypointFollower(LeafSystem):
         if target is None or target.contact_force is None or motion.time_reached is not None:
             return False
         change = self._force_input.Eval(context) - motion.force_start
-        return float(np.linalg.norm(change)) > target.contact_force
+        return not float(np.linalg.norm(change)) <= target.contact_force  # NaN: it stays there
 
     def _check(self, target: EndEffectorTarget) -> EndEffectorTarget:
         """Refuses a target that can't be followed."""
@@ -249,9 +262,8 @@ class WaypointFollower(LeafSystem):
             braking = math.sqrt(2.0 * acceleration * (1.0 - progress))
             rate = min(rate + acceleration * config.period, cruise, braking)
             progress += rate * config.period
-            if 1.0 - progress < 1e-6 or rate * config.period < 1e-9:
+            if 1.0 - progress < 1e-6:
                 progress, rate = 1.0, 0.0
-            progress = min(progress, 1.0)
         else:
             progress, rate = 1.0, 0.0
 

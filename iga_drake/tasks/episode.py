@@ -1,5 +1,6 @@
 """One seeded episode of a task: built, stepped, judged."""
 
+import contextlib
 import time as wall
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -22,6 +23,7 @@ from iga_drake.demonstrations.demonstration import (
     Trajectory,
     Waypoint,
 )
+from iga_drake.demonstrations.recording import Recording
 from iga_drake.demonstrations.store import read_demonstrations
 from iga_drake.paths import models_dir
 from iga_drake.policy.inference import (
@@ -217,8 +219,11 @@ class ExpertInference:
 
 
 def demonstrations_path(scenario: Scenario) -> Path:
-    """The folder of the scenario's demonstrations; relative paths start at `models/`."""
+    """The folder of the scenario's demonstrations; relative paths start at `models/`, `~` is the
+    user's home."""
     path = Path(scenario.demonstrations)
+    with contextlib.suppress(RuntimeError):  # no such user
+        path = path.expanduser()
     return path if path.is_absolute() else models_dir() / path
 
 
@@ -562,20 +567,30 @@ def record_demonstrations(
     count: int,
     first_seed: int = 0,
     on_event: Callable[[str], None] | None = print,
+    recording: Recording | None = None,
 ) -> DemonstrationSet:
     """Lets the expert do the task on demonstration objects until `count` episodes succeeded.
 
+    Attempts that `recording` holds are taken from there, the others are kept in it.
     Raises `TaskError` if more than half of the attempts fail.
     """
     if count < 1:
         raise TaskError(f"demonstrations: {count} asked for, at least 1 is needed")
     kept: list[Demonstration] = []
     for seed in range(first_seed, first_seed + 2 * count + 1):
+        before = recording is not None and recording.done(seed)
         if on_event:
-            on_event(f"{scenario.task.name}, seed {seed}, demonstration objects")
-        with Episode(scenario, seed=seed, aligner=EXPERT, split="demonstration") as episode:
-            if episode.run(on_event).success:
-                kept.append(episode.demonstration())
+            done = ", recorded before" if before else ""
+            on_event(f"{scenario.task.name}, seed {seed}, demonstration objects{done}")
+        if recording is not None and before:
+            found = recording.get(seed)
+        else:
+            with Episode(scenario, seed=seed, aligner=EXPERT, split="demonstration") as episode:
+                found = episode.demonstration() if episode.run(on_event).success else None
+            if recording is not None:
+                recording.add(seed, found)
+        if found is not None:
+            kept.append(found)
         if len(kept) == count:
             return DemonstrationSet(task=scenario.task.name, demonstrations=tuple(kept))
     raise TaskError(

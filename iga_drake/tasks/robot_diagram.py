@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from iga_drake.demonstrations.demonstration import DemonstrationSet
@@ -46,6 +47,7 @@ WIRES: Mapping[str, tuple[str, ...]] = {
     "fusion.target_cloud": ("policy.target_cloud",),
     "fusion.grasped_cloud": ("policy.grasped_cloud",),
     "fusion.camera_counts": ("policy.camera_counts",),
+    "fusion.cloud_losses": ("policy.cloud_losses",),
     "forward_kinematics.pose": ("policy.pose_measured", "follower.pose_measured"),
     "external_force.force": ("follower.force_measured",),
     "policy.target": ("follower.target",),
@@ -104,6 +106,10 @@ def build_robot_diagram(
             gripper=gripper_cloud,
             solve=lambda X_WE, near: solver.solve(X_WE, near=near),
             config=scenario.policy,
+            workspace=(
+                np.array(scenario.supervisor.workspace_lower),
+                np.array(scenario.supervisor.workspace_upper),
+            ),
             seed=seed + scenario.seeds.aligner,
         )
     )

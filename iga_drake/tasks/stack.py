@@ -43,6 +43,7 @@ RELEASE_OPENING = (
     0.03  # m; more would push the outer finger, which points down, into the bowl below
 )
 _WORK_AREA = WorkArea(lower=(0.42, -0.25), upper=(0.65, 0.25), reach=(0.48, 0.68))
+_MOST_PAIRS = 10_000  # bowls drawn for two that fit
 _GRIP_DEPTH = (0.004, 0.007)  # m from the rim to the middle of the pads
 _GRIP_ROLL = 0.1  # rad about the fingers' direction
 _COLORS = ((0.85, 0.83, 0.76), (0.2, 0.42, 0.6), (0.72, 0.35, 0.24), (0.35, 0.55, 0.4))
@@ -68,7 +69,7 @@ def grip(shape: ShapeInstance, *, depth: float, roll: float) -> tuple[RigidTrans
 def _pair(seed: int) -> Mapping[str, ShapeInstance]:
     """Draws bowls until one can be put into the other by a hand that holds its rim."""
     rng = np.random.default_rng(seed)
-    while True:
+    for _ in range(_MOST_PAIRS):
         target = bowl.sample_parameters(rng)
         held = bowl.sample_parameters(rng)
         if not 0.8 <= held["diameter"] / target["diameter"] <= 1.03 or target["diameter"] < 0.125:
@@ -83,6 +84,7 @@ def _pair(seed: int) -> Mapping[str, ShapeInstance]:
         sunk = 1.0 - nested / bowl.profile(target).profile[:, 1].max()
         if release - nested <= MAXIMUM_DROP and sunk > DEPTH_SHARE + 0.2:
             return shapes
+    raise TaskError(f"seed {seed}: no two bowls of {_MOST_PAIRS} fit into each other")
 
 
 class Stack(Task):

@@ -17,7 +17,7 @@ from iga_drake.aligners.iga.aligner import IgaAligner
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
 from iga_drake.aligners.iga.weights import DESCRIPTOR as KIND
 from iga_drake.aligners.iga.weights import descriptor_config
-from iga_drake.checkpoint import CheckpointError, load_checkpoint
+from iga_drake.checkpoint import CheckpointError, check_finite, load_checkpoint
 from iga_drake.dataset.loader import sample_loader
 from iga_drake.dataset.samples import SampleConfig
 from iga_drake.training.correspondence import (
@@ -143,6 +143,7 @@ def train_descriptor(
     net = DescriptorNet(model).to(device)
     if initial is not None and saved is None:
         loaded, _ = load_checkpoint(initial, kind=KIND)
+        check_finite(initial, loaded)
         _take_over(net, loaded, initial)
     run = TrainingRun(
         output,

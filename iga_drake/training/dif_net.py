@@ -13,7 +13,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from iga_drake.checkpoint import CheckpointError, load_checkpoint
+from iga_drake.checkpoint import CheckpointError, check_finite, load_checkpoint
 from iga_drake.shapes.dif_net import (
     KIND,
     DifNet,
@@ -238,6 +238,7 @@ def _draw(config: DifNetTraining, world: int) -> tuple[Tensor, Tensor, Tensor]:
 def _take_over(net: DifNet, path: Path) -> None:
     """Loads weights of as many shapes; raises `CheckpointError`."""
     loaded, card = load_checkpoint(path, kind=KIND)
+    check_finite(path, loaded)
     try:
         net.load_state_dict(loaded)
     except RuntimeError as error:

@@ -37,7 +37,7 @@ from iga_drake.aligners.iga_paper.search import (
     uniform,
 )
 from iga_drake.aligners.iga_paper.variants import descent
-from iga_drake.checkpoint import CheckpointError, load_checkpoint
+from iga_drake.checkpoint import CheckpointError, check_finite, load_checkpoint
 from iga_drake.dataset.alignment_error import displacement, equivalents, nearest_error
 from iga_drake.dataset.loader import Batch, collate, sample_loader
 from iga_drake.dataset.samples import SampleConfig, make_sample
@@ -592,6 +592,7 @@ def _take_over(net: PaperModel, path: Path, part: str) -> dict:
     """Weights from a checkpoint of the same part; returns what they have `taken`. Raises
     `CheckpointError`."""
     tensors, card = load_checkpoint(path, kind=kind_of(part))
+    check_finite(path, tensors)
     try:
         net.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
     except RuntimeError as error:

@@ -14,7 +14,7 @@ from pydrake.multibody.meshcat import ContactVisualizer, ContactVisualizerParams
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
-from iga_drake.errors import check_range
+from iga_drake.errors import ConfigError, check_range, error_text
 
 
 @dataclass
@@ -34,14 +34,21 @@ class Visualization:
     def check(self, where: str = "visualization") -> None:
         """Raises `ConfigError` for a value out of range."""
         period, port = self.publish_period, self.port
-        check_range(period > 0, f"{where}.publish_period", period, "> 0")
+        check_range(1e-3 <= period <= 10, f"{where}.publish_period", period, "0.001 to 10")
         valid = port is None or port == 0 or 1024 <= port <= 65535
         check_range(valid, f"{where}.port", port, "null, 0 (any free one), or 1024..65535")
 
 
 def start_meshcat(config: Visualization) -> Meshcat:
-    """Starts a server that only this machine reaches."""
-    return Meshcat(MeshcatParams(host="localhost", port=config.port, show_stats_plot=False))
+    """Starts a server that only this machine reaches. Raises `ConfigError` where its port is taken
+    or none is free."""
+    try:
+        return Meshcat(MeshcatParams(host="localhost", port=config.port, show_stats_plot=False))
+    except RuntimeError as error:
+        raise ConfigError(
+            f"visualization.port: {config.port} can't be used ({error_text(error)}): name another, "
+            "or null for the first free one"
+        ) from error
 
 
 def add_visualizers(

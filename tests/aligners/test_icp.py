@@ -1,10 +1,14 @@
 """ICP on objects that it has seen: the exact pose comes back."""
 
+import sys
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from iga_drake.aligners.icp import IcpAligner
+from iga_drake.aligners.protocol import AlignerError
+from iga_drake.aligners.registry import make_aligner
 from iga_drake.dataset.samples import make_sample
 from iga_drake.demonstrations.alignment import Alignment, CloudError
 
@@ -49,3 +53,18 @@ def test_a_way_up_of_another_length_is_refused() -> None:
     cloud = _brick(np.random.default_rng(0))
     with pytest.raises(CloudError, match=r"target_up: .*length 2"):
         IcpAligner().align((Alignment(cloud, cloud),), cloud, cloud, target_up=np.array([0, 0, 2]))
+
+
+def test_a_missing_package_is_told_when_the_aligner_is_made(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(AlignerError, match=r"Open3D is not installed: pip install"):
+        make_aligner("icp")
+
+
+@pytest.mark.parametrize(
+    "options", [{"starts": 0}, {"starts": "many"}, {"starts": 2.5}, {"voxel": float("nan")},
+                {"refined": 1e9}, {"starts": [1]}],
+)  # fmt: skip
+def test_options_that_cannot_be_are_refused(options: dict) -> None:
+    with pytest.raises(AlignerError):
+        make_aligner("icp", **options)

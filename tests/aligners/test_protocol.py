@@ -4,9 +4,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 from paper_networks import untrained
 
-from iga_drake.aligners.protocol import AlignerError, PoseEstimate, check_aligns
+from iga_drake.aligners.protocol import (
+    AlignerError,
+    PoseEstimate,
+    check_aligns,
+    check_question,
+)
 from iga_drake.aligners.registry import aligner_names, make_aligner
 from iga_drake.demonstrations.alignment import Alignment, CloudError, check_cloud, check_direction
 
@@ -107,3 +115,60 @@ def test_what_cannot_be_asked_as_the_protocol_says_is_refused() -> None:
         with pytest.raises(AlignerError, match=r"aligner 'old': it can't be asked with align"):
             check_aligns(wrong, "old")
     check_aligns(make_aligner("icp"), "icp")
+
+
+ANYTHING = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.floats(),
+    st.text(max_size=5),
+    st.lists(st.floats(), max_size=3),
+    arrays.arrays(np.float64, arrays.array_shapes(min_dims=0, max_dims=4, max_side=4, min_side=0)),
+    arrays.arrays(np.float64, (2, 4, 4), elements=st.floats(-2, 2)),
+    st.just(np.stack([np.eye(4)] * 2)),
+    st.just(np.ones(2)),
+)
+
+
+@given(ANYTHING, ANYTHING, ANYTHING, ANYTHING)
+def test_an_estimate_is_one_or_is_refused(poses, energies, probabilities, familiarity) -> None:
+    try:
+        found = PoseEstimate(poses, energies, probabilities, familiarity)
+    except AlignerError as error:
+        assert str(error).startswith("PoseEstimate.")
+        return
+    M = len(found.poses)
+    assert found.poses.shape == (M, 4, 4) and M >= 1
+    assert found.energies.shape == found.probabilities.shape == (M,)
+    R = found.poses[:, :3, :3]
+    np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (M, 1, 1)), atol=2e-6)
+    np.testing.assert_allclose(np.linalg.det(R), 1, atol=1e-5)
+    assert np.isfinite(found.energies).all() and (found.probabilities >= 0).all()
+    assert found.familiarity is None or 0 <= found.familiarity <= 1
+
+
+@given(ANYTHING)
+def test_whatever_an_aligner_returns_is_an_estimate_or_refused(found) -> None:
+    with pytest.raises(AlignerError, match=f"returned {type(found).__name__}, a PoseEstimate"):
+        PoseEstimate.of(found)
+
+
+@given(ANYTHING, ANYTHING, st.sampled_from([0, -1, 2.5, "3", 2**80]))
+def test_clouds_of_a_question_are_clouds_or_refused(grasped, target, seed) -> None:
+    with pytest.raises((AlignerError, CloudError)):
+        check_question("any", (Alignment(CLOUD, CLOUD),), grasped, target, seed=seed)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-3, 0.09, 11, 1e3, 1e150])
+def test_clouds_in_other_units_are_refused_by_name(scale: float) -> None:
+    context = (Alignment(CLOUD, CLOUD),)
+    with pytest.raises(AlignerError, match=r"any: the cloud 'target' is .* m large, .* both in m"):
+        check_question("any", context, CLOUD, CLOUD * scale)
+    far = np.concatenate([CLOUD * 5, np.full((1, 3), 1e30)])  # one stray point isn't a size
+    check_question("any", context, CLOUD / 5, far)
+
+
+def test_a_context_of_something_else_is_refused() -> None:
+    for context, message in (((), "is empty"), (((CLOUD, CLOUD),), "holds tuple")):
+        with pytest.raises(AlignerError, match=f"any: the context {message}"):
+            check_question("any", context, CLOUD, CLOUD)

@@ -67,15 +67,68 @@ def test_aligners_are_checked_first(capsys):
     assert "the expert takes none" in line
 
 
-def test_a_bug_does_not_look_like_bad_input(capsys, monkeypatch):
+@pytest.mark.parametrize(
+    "bug", [RuntimeError("a bug\nin two lines"), SystemExit("a bug in two lines"), OSError("a bug")]
+)
+def test_a_bug_does_not_look_like_bad_input(capsys, monkeypatch, tmp_path: Path, bug):
     def broken(arguments):
-        raise RuntimeError("a bug\nin two lines")
+        raise bug
 
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(shapes, "run", broken)
-    assert cli.main(["shapes", "list"]) == cli.INTERNAL == 3
+    for _ in range(2):
+        assert cli.main(["shapes", "list"]) == cli.INTERNAL == 3
+    line = capsys.readouterr().err.splitlines()[-1]
+    told, _, place = line.partition("; traceback in ")
+    assert told.startswith(f"iga shapes: internal error: {type(bug).__name__}: a bug")
+    text = Path(place).read_text()
+    assert text.startswith("Traceback") and "in broken" in text
+
+
+def test_where_no_traceback_can_be_kept_it_is_printed(capsys, monkeypatch, tmp_path: Path):
+    def broken(arguments):
+        raise RuntimeError("a bug")
+
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setattr(shapes, "run", broken)
+    assert cli.main(["shapes", "list"]) == cli.INTERNAL
     error = capsys.readouterr().err
-    assert "Traceback" in error and "in broken" in error
-    assert error.endswith("iga shapes: internal error: RuntimeError: a bug in two lines\n")
+    assert "in broken" in error and error.endswith("internal error: RuntimeError: a bug\n")
+
+
+def test_an_interrupt_ends_quietly(capsys, monkeypatch):
+    def interrupted(arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(shapes, "run", interrupted)
+    assert cli.main(["shapes", "list"]) == cli.INTERRUPTED == 130
+    assert capsys.readouterr().err == "iga shapes: interrupted\n"
+
+
+def test_a_full_disk_is_no_bug(capsys, monkeypatch):
+    def full(arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(shapes, "run", full)
+    assert "No space left on device" in refused(capsys, "shapes", "list")
+
+
+def test_the_echo_of_bad_input_has_an_end(capsys, tmp_path: Path):
+    path = tmp_path / "scenario.yaml"
+    path.write_text(f"{'x' * 100_000}: 1\n")
+    assert len(refused(capsys, "simulate", str(path))) < 2000
+    assert len(refused(capsys, "simulate", "y" * 100_000)) < 2000
+
+
+@pytest.mark.parametrize("option", ["--html", "--result"])
+def test_outputs_are_checked_before_the_work(capsys, tmp_path: Path, option: str):
+    notes = tmp_path / "notes.json"
+    notes.write_text("my notes")
+    for place in (tmp_path, notes / "x.html", Path("/dev/full"), Path("/proc/none/x.html")):
+        assert str(place) in refused(capsys, "simulate", "grasp", option, str(place))
+    line = refused(capsys, "simulate", "grasp", "--result", str(notes))
+    assert "begins with b'my notes'" in line and notes.read_text() == "my notes"
 
 
 def test_help_is_quick():

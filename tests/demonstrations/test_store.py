@@ -13,7 +13,13 @@ from iga_drake.demonstrations.demonstration import (
     DemonstrationSet,
     Provenance,
 )
-from iga_drake.demonstrations.store import MANIFEST, read_demonstrations, write_demonstrations
+from iga_drake.demonstrations.store import (
+    MANIFEST,
+    check_replaceable,
+    read_demonstrations,
+    write_demonstrations,
+)
+from iga_drake.errors import IgaDrakeError
 from iga_drake.paths import models_dir
 from iga_drake.tasks.registry import make_task
 
@@ -186,10 +192,58 @@ def test_the_old_set_comes_back_where_the_new_one_cannot_take_its_place(folder: 
         rename(source, target)
 
     monkeypatch.setattr(os, "rename", fail_for_the_new_one)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(DemonstrationError, match=r"demos: can't be written \(No space left"):
         write_demonstrations(folder, make_set(1))
     assert len(read_demonstrations(folder)) == 2
     assert [path.name for path in folder.parent.iterdir()] == ["demos"]
+
+
+def test_what_does_not_belong_to_a_set_is_never_deleted(folder: Path):
+    (folder / "notes.txt").write_text("mine")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(DemonstrationError, match=r"holds \['notes.txt'\] besides demonstrations"):
+        write_demonstrations(folder, make_set(1))
+    assert before == {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", '{"format": "a web page"}', "{" * 3000])
+def test_a_manifest_of_something_else_is_not_overwritten(tmp_path: Path, text: str):
+    (tmp_path / MANIFEST).write_text(text)
+    with pytest.raises(DemonstrationError, match="is not one of demonstrations, so it is not over"):
+        write_demonstrations(tmp_path, make_set(1))
+    assert (tmp_path / MANIFEST).read_text() == text
+
+
+def test_a_link_to_a_folder_stays_a_link(folder: Path):
+    link = folder.parent / "link"
+    link.symlink_to(folder)
+    write_demonstrations(link, make_set(1))
+    assert link.is_symlink() and len(read_demonstrations(folder)) == 1
+    assert sorted(path.name for path in folder.parent.iterdir()) == ["demos", "link"]
+
+
+def test_a_process_that_was_ended_while_it_replaced_a_set_lost_nothing(folder: Path):
+    os.rename(folder, folder.parent / ".demos.old")  # here it was ended
+    (folder.parent / ".demos.partial").mkdir()
+    check_replaceable(folder)
+    assert len(read_demonstrations(folder)) == 2
+    write_demonstrations(folder, make_set(1))
+    assert len(read_demonstrations(folder)) == 1
+    assert [path.name for path in folder.parent.iterdir()] == ["demos"]
+
+
+@pytest.mark.parametrize("name", ["with space", "Größe", "50%20#1?", "a" * 200])
+def test_any_name_will_do(tmp_path: Path, name: str):
+    write_demonstrations(tmp_path / name / name, make_set(1))
+    assert len(read_demonstrations(tmp_path / name / name)) == 1
+
+
+@pytest.mark.parametrize("name", ["a" * 300, "/dev/null", "/proc/none", "file/demos"])
+def test_places_where_nothing_can_be_written_are_refused(tmp_path: Path, name: str):
+    (tmp_path / "file").touch()
+    with pytest.raises(IgaDrakeError):
+        write_demonstrations(tmp_path / name, make_set(1))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_another_task_is_refused(folder: Path):

@@ -1,6 +1,7 @@
 """The store of results: rows are found by all of their key, torn lines go, foreign files stay."""
 
 import json
+import resource
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from iga_drake.evaluation.results import (
     folder_digest,
     text_digest,
 )
+from iga_drake.files import OutputError
 
 KEY = {"kind": "tea", "options": {"a": 1, "b": [2]}, "seed": 3}
 
@@ -62,6 +64,29 @@ def test_a_foreign_file_is_refused_and_left_alone(content: bytes, line: int, tmp
     with pytest.raises(ResultsError, match=rf"results\.jsonl, line {line}: not a result"):
         ResultsStore(path)
     assert path.read_bytes() == content
+
+
+def test_a_full_disk_leaves_whole_rows(tmp_path: Path) -> None:
+    store = ResultsStore(tmp_path / "results.jsonl")
+    store.add(KEY, {"success": True})
+    whole = store.path.read_bytes()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole) + 20, before[1]))
+    try:
+        with pytest.raises(ResultsError, match=r"results\.jsonl: can't be written"):
+            store.add(KEY | {"seed": 4}, {"success": True})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert store.path.read_bytes() == whole
+    store.add(KEY | {"seed": 4}, {"success": False})
+    assert len(list(ResultsStore(store.path).rows())) == 2
+
+
+@pytest.mark.parametrize("place", ["", "/dev/full", "file/results.jsonl"])
+def test_places_where_no_results_can_be_written(tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError):
+        ResultsStore(tmp_path / place)
 
 
 def test_threads_may_share_a_store(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from scipy.stats import binomtest
 
 from iga_drake.evaluation.results import ResultsStore
 from iga_drake.evaluation.task_success import (
+    BROKEN,
     EvaluationError,
     Trial,
     TrialResult,
@@ -74,6 +75,31 @@ def test_an_interrupted_evaluation_goes_on(tmp_path: Path):
     assert [result.reused for result in results] == [True] * 3 + [False] * 2
     assert [replace(result, reused=False) for result in results[:3]] == first
     assert "3 reused" in format_table(results) and "reused" not in format_table(first)
+
+
+def test_a_broken_process_is_no_result(tmp_path: Path):
+    store = ResultsStore(tmp_path / "results.jsonl")
+
+    def broken(trial: Trial) -> TrialResult:
+        return replace(FakeRun()(trial), success=False, cause=BROKEN, reason="exit status 3: bug")
+
+    (result,) = evaluate(make_trials([4]), store=store, run=broken)
+    assert result.cause == BROKEN and "exit status 3" in format_table([result])
+    (again,) = evaluate(make_trials([4]), store=store, run=FakeRun())
+    assert again.success and not again.reused
+
+
+def test_an_interrupt_ends_it_and_keeps_what_is_done(tmp_path: Path):
+    store, run = ResultsStore(tmp_path / "results.jsonl"), FakeRun()
+
+    def interrupted(result: TrialResult) -> None:
+        if result.seed == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(make_trials(range(500)), store=store, run=run, on_result=interrupted)
+    assert len(run.seeds) < 400
+    assert {key["seed"] for key, _ in store.rows()} >= {0, 1, 2}
 
 
 def test_results_of_other_conditions_are_not_taken_over(tmp_path: Path):

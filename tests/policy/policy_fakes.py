@@ -76,7 +76,8 @@ class FakeInputs:
     """A world where every target is reached one tick after it is set."""
 
     clouds: dict = field(default_factory=lambda: {"target": TARGET, "grasped": TARGET})
-    silent: dict = field(default_factory=dict)
+    counts: dict = field(default_factory=dict)
+    lost: str = ""
     X_WE: RigidTransform = X_PRESENT
     follower_status: FollowerStatus = field(default_factory=FollowerStatus)
     supervisor_status: SupervisorStatus = field(default_factory=SupervisorStatus)
@@ -86,8 +87,11 @@ class FakeInputs:
         self.pulled.append(role)
         return self.clouds[role]
 
-    def silent_cameras(self):
-        return self.silent
+    def cameras(self):
+        return self.counts
+
+    def losses(self, role):
+        return self.lost
 
     def pose(self):
         return self.X_WE
@@ -127,7 +131,14 @@ def make_demonstrations(motion=GRASP, openings=(0.01, 0.06), upright=(True,)) ->
 
 
 def make_machine(
-    motion=GRASP, aligner=None, solve=None, service=None, seed=0, upright=(True,), **config
+    motion=GRASP,
+    aligner=None,
+    solve=None,
+    service=None,
+    seed=0,
+    upright=(True,),
+    workspace=None,
+    **config,
 ):
     demonstrations = make_demonstrations(motion, upright=upright)
     return PolicyMachine(
@@ -137,5 +148,6 @@ def make_machine(
         gripper=lambda opening: GRIPPER,
         solve=solve or (lambda X_WE, near: near),
         config=PolicyConfig(period=0.1, **{"observe_limit": 10.0, **config}),
+        workspace=workspace,
         seed=seed,
     )

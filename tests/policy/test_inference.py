@@ -142,7 +142,7 @@ def test_looking_for_an_answer_does_not_wait(worker):
         (2, f"worker process was ended by signal {int(signal.SIGSEGV)}"),
         (3, "worker process exited with status 5"),
         (4, "ValueError: no such luck"),
-        (5, "AttributeError"),
+        (5, "returned NoneType, a PoseEstimate is expected"),
     ],
 )
 def test_what_goes_wrong_is_told_and_the_next_question_is_answered(worker, seed, reason):

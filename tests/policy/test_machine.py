@@ -24,6 +24,7 @@ from iga_drake.aligners.protocol import AlignerError, PoseEstimate
 from iga_drake.policy.inference import LocalInference
 from iga_drake.policy.machine import PolicyMachine
 from iga_drake.policy.motion import Phase, PolicyError, TaskMotion
+from iga_drake.systems.fusion import CameraCounts
 from iga_drake.systems.messages import Cause, FollowerStatus, SupervisorStatus
 
 
@@ -169,7 +170,7 @@ def test_a_better_second_look_is_taken():
         ({"clouds": {"target": np.zeros((0, 3))}}, "cloud of 'pan' is empty"),
         ({"clouds": {"target": np.full((400, 3), np.nan)}}, "'pan' has 0 usable points"),
         ({"clouds": {"target": TARGET[:20]}}, "20 usable points"),
-        ({"silent": {"camera_1": "is off"}}, "camera_1 is off"),
+        ({"counts": {"camera_1": CameraCounts(0, 0, 0, "is off")}}, "camera_1 is off"),
     ],
 )
 def test_bad_observations_are_refused_and_the_arm_held(changes, reason):
@@ -180,6 +181,44 @@ def test_bad_observations_are_refused_and_the_arm_held(changes, reason):
     assert reason in memory.status.reason
     assert not aligner.calls
     assert list(targets) == [0], "no motion was ever asked for"
+
+
+def test_what_it_waits_for_is_told_at_once():
+    inputs = FakeInputs(clouds={"target": np.zeros((0, 3))}, lost="nothing is labelled")
+    machine = make_machine()
+    memory = machine.advance(machine.start(), inputs, 0.5)
+    assert memory.status.phase is Phase.OBSERVE
+    assert memory.status.waits_for == "the cloud of 'pan' is empty: nothing is labelled"
+    inputs.clouds = {"target": TARGET}
+    assert machine.advance(memory, inputs, 2.6).status.waits_for == ""
+
+
+@pytest.mark.parametrize(("least", "refused"), [(None, True), (3, True), (2, False), (1, False)])
+def test_wrong_cameras_are_left_out_where_enough_are_good(least: int | None, refused: bool):
+    counts = {name: CameraCounts(9, 9, 9) for name in ("a", "b")}
+    inputs = FakeInputs(counts=counts | {"c": CameraCounts(0, 0, 0, "is off")})
+    memory, _ = run(make_machine(minimum_cameras=least), inputs)
+    assert (memory.status.phase is Phase.REFUSED) == refused
+    assert not refused or "c is off" in memory.status.reason
+
+
+def test_poses_outside_the_workspace_are_refused_before_anything_moves():
+    low, high = np.array([0.0, -1.0, 0.0]), np.array([1.0, 1.0, 1.0])
+    inside, outside = X_GOAL, RigidTransform(X_GOAL.rotation(), [0.5, 0.1, -0.02])
+    for poses, phase in (((outside,), Phase.REFUSED), ((outside, inside), Phase.DONE)):
+        machine = make_machine(aligner=FakeAligner(poses=poses), workspace=(low, high))
+        memory, targets = run(machine, FakeInputs())
+        assert memory.status.phase is phase
+    assert memory.chosen[0].mode == 1
+    machine = make_machine(aligner=FakeAligner(poses=(outside,)), workspace=(low, high))
+    memory, targets = run(machine, FakeInputs())
+    assert list(targets) == [0] and memory.status.cause is Cause.IK
+    reason = "the pose at grip lies outside the workspace: z = -0.020 m, allowed: 0 to 1 m"
+    assert reason in memory.status.reason
+    high = np.array([1.0, 1.0, 0.2])  # lower than where the held thing is shown
+    memory, targets = run(make_machine(STACK, workspace=(low, high)), FakeInputs())
+    assert (memory.status.phase, list(targets)) == (Phase.REFUSED, [0])
+    assert "the pose that shows 'held' lies outside the workspace" in memory.status.reason
 
 
 def test_some_nan_points_are_dropped():
@@ -220,7 +259,7 @@ def test_poses_that_are_not_finite_are_refused():
 
 def test_objects_that_look_like_none_of_the_demonstrations_are_refused_where_asked():
     for familiarity, least, refused in (
-        (0.2, 0.0, False), (0.2, 0.5, True), (None, 0.5, False), (np.nan, 0.5, True),
+        (0.2, 0.0, False), (0.2, 0.5, True), (None, 0.5, False),
     ):  # fmt: skip
         aligner = FakeAligner(familiarity=familiarity)
         machine = make_machine(aligner=aligner, minimum_familiarity=least)

@@ -1,7 +1,11 @@
 import dataclasses
+import tempfile
+from pathlib import Path
 
 import pytest
 import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pydrake.multibody.plant import MultibodyPlantConfig
 
 from iga_drake.paths import diagrams_dir
@@ -9,6 +13,7 @@ from iga_drake.station.cameras.rgbd import LookAt, Pose, RgbdCamera
 from iga_drake.station.scenario import (
     Scenario,
     ScenarioError,
+    _fields,
     load_scenario,
 )
 
@@ -169,7 +174,7 @@ def test_wrong_type_names_the_key(tmp_path, text, where):
         ("panda: {visuals: shiny}", "panda.visuals"),
         ("table: {size: [1, 1]}", "table.size"),
         ("table: {size: [1, 1, -1]}", "table.size"),
-        ("cameras: {}", "at least one camera"),
+        ("cameras: {}", "1 to 32 cameras"),
         ("cameras: {a: {pose: {position: [1, 2]}}}", "cameras.a.pose.position"),
         ("cameras: {a: {pose: {position: [1, 2, 3], target: [1, 2, 0]}}}", "cameras.a.pose.target"),
         ("cameras: {a: {near: 4}}", "near < far"),
@@ -196,6 +201,100 @@ def test_wrong_type_names_the_key(tmp_path, text, where):
 )
 def test_value_out_of_range_names_the_key(tmp_path, text, where):
     assert where in _message(tmp_path, text)
+
+
+# Every number of the schema by its key, and what users mistake: units, percent, signs.
+def _numbers(value, where="") -> list[str]:
+    fields = _fields(type(value))
+    if fields is not None:
+        dot = f"{where}." if where else ""
+        return [key for f in fields for key in _numbers(getattr(value, f), f"{dot}{f}")]
+    if isinstance(value, dict):
+        return [key for k, v in value.items() for key in _numbers(v, f"{where}.{k}")]
+    if isinstance(value, list):
+        return [f"{where}[]"]
+    return [where] if isinstance(value, int | float) and not isinstance(value, bool) else []
+
+
+NUMBERS = _numbers(load_scenario("one_of_everything"))
+WILD = [-1e300, -1.0, 1e9, 1e300, "7000", None, [], {}, "nan", ".inf", "1e400", "9" * 5000]
+
+
+@pytest.mark.parametrize("key", NUMBERS)
+def test_every_number_has_an_upper_bound_and_is_named(key: str):
+    name = key.removesuffix("[]")
+    for value in (1e300, -1e300):
+        text = f"[{value}, {value}, {value}]" if key.endswith("[]") else f"{value}"
+        with pytest.raises(ScenarioError) as error:
+            load_scenario("one_of_everything", overrides=[f"{name}={text}"])
+        assert name.rpartition(".")[0] in str(error.value) and len(str(error.value)) < 400
+
+
+@given(st.sampled_from(NUMBERS), st.sampled_from(WILD) | st.floats() | st.integers())
+@settings(max_examples=60)
+def test_any_value_is_accepted_within_its_bounds_or_refused_by_name(key: str, value):
+    text = str(value).lower() if value is None or isinstance(value, float) else f"{value}"
+    try:
+        scenario = load_scenario("grasp", overrides=[f"{key.removesuffix('[]')}={text}"])
+    except ScenarioError as error:
+        assert len(str(error)) < 2000
+        return
+    assert load_scenario("grasp").to_yaml() != "" and scenario.to_yaml() != ""
+
+
+NODES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(
+        st.sampled_from(["task", "name", "cameras", "fusion", "policy", "_tag", "a"]), inner,
+        max_size=3,
+    ),
+    max_leaves=8,
+)  # fmt: skip
+
+
+@given(NODES)
+@settings(max_examples=60)
+def test_any_file_is_read_or_refused(node):
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scenario.yaml"
+        path.write_text(yaml.safe_dump(node))
+        try:
+            load_scenario(path)
+        except ScenarioError as error:
+            assert str(path) in str(error) and len(str(error)) < 2500
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 1500,
+        "task: {name: " + "9" * 5000 + "}",
+        "fusion: {voxel_size: " + "9" * 5000 + "}",
+        "a: &a [*a]",
+        "task: &a {name: *a}",
+        "x" * 90_000 + ": 1",
+        "task: {name: !!python/object/apply:os.system [ls]}",
+        "? [1, 2]\n: 3",
+        "task: {name: " + "y" * 50_000 + ", time_limit: z}",
+        "- " * 3000,
+    ],
+)
+def test_files_that_are_too_much_are_refused_in_few_words(tmp_path, text):
+    assert len(_message(tmp_path, text)) < 2500
+
+
+def test_few_lines_that_stand_for_many_are_read_quickly(tmp_path):
+    lines = ["  - &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]"]
+    lines += [f"  - &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 30)]
+    message = _message(tmp_path, "task:\n  name:\n" + "\n".join(lines))
+    assert "task.name: expected str, found list" in message and len(message) < 1000
+
+
+def test_a_large_file_is_not_read(tmp_path):
+    path = tmp_path / "scenario.yaml"
+    path.write_bytes(b"#" * 2_000_000)
+    with pytest.raises(ScenarioError, match="2000000 bytes, a scenario has at most 1000000"):
+        load_scenario(path)
 
 
 def test_missing_and_broken_files(tmp_path):

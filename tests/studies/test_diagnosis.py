@@ -22,6 +22,7 @@ from iga_drake.studies.diagnosis import (
     ObjectMatches,
     Problem,
     add_evaluate_diagnosis,
+    contrast,
     deformation,
     descend,
     evaluate_diagnosis,
@@ -104,6 +105,33 @@ def test_deformation_is_what_scale_and_motion_leave(problem: Problem) -> None:
     assert 0.001 < mild < strong / 3
 
 
+def test_contrast_tells_a_turned_box_from_a_turned_arch(problem: Problem) -> None:
+    """A half-turn of a box about an axis of its own can't be seen; of an arch it can."""
+    rng = np.random.default_rng(0)
+    flat = rng.uniform(-1, 1, (2, 5, 512, 3)) * [0.5, 0.3, 0.1]
+    arch = flat * [1, 1, 0] + [0, 0, 2] * flat[..., :1] ** 2
+    X = np.stack([random_pose(k) for k in range(10)]).reshape(2, 5, 4, 4)
+    half = np.diag([-1.0, 1, -1, 1])  # about y
+
+    def contrast_of(canonical: np.ndarray) -> float:
+        places = canonical + rng.normal(0, 0.01, canonical.shape)
+        points = places @ np.swapaxes(X[..., :3, :3], -1, -2) + X[..., None, :3, 3]
+        sample = replace(
+            problem.sample,
+            points=points,
+            canonical=places,
+            size=np.ones((2, 5)),
+            modes=np.eye(4)[None],
+            category=("composite", "composite"),
+            surface=np.empty((2, 0, 2, 3), np.float32),
+        )
+        own = X[0, -1]
+        return contrast(sample, own @ half @ np.linalg.inv(own))
+
+    assert contrast_of(flat) < 1.3
+    assert contrast_of(arch) > 2
+
+
 def test_descent_ends_at_the_minimum() -> None:
     goal = torch.from_numpy(random_pose(0))
 
@@ -127,7 +155,21 @@ def _row(index: int, error: float, energies: tuple[float, ...], deformed: float)
     errors = dict.fromkeys(POSES, (error / 100, np.radians(error)))
     objects = (_matches("mug", 10, 90),)
     flip = TURNED[0] if error > 8 else ""
-    return Diagnosis("easy", index, errors, *energies, deformed, objects, ("mug", "pan"), flip)
+    return Diagnosis(
+        split="easy",
+        index=index,
+        errors=errors,
+        energy_found=energies[0],
+        energy_truth=energies[1],
+        energy_from_found=energies[2],
+        energy_from_truth=energies[3],
+        deformation=deformed,
+        objects=objects,
+        categories=("mug", "pan"),
+        flip=flip,
+        probability=0.98,
+        contrast=error,
+    )
 
 
 def test_shares_of_wrong_hypotheses() -> None:
@@ -147,6 +189,8 @@ def test_the_summary_counts_energies_and_sorts_by_deformation() -> None:
     table = summary.table(categories=True)
     assert "67 % of the samples" in table and "mug" in table
     assert summary.flips_by_category == {"mug": (3, 1), "pan": (3, 1)}
+    assert summary.contrast == ((9.0,), (1.0, 5.0))
+    assert summary.calibration == ((3, pytest.approx(0.98), pytest.approx(2 / 3)),)
     assert summary.flips_by_axis == {TURNED[0]: 1} and "mug: 1 of 3" in table
     assert "grasped, long axis: 1" in table
 

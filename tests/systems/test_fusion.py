@@ -1,6 +1,11 @@
+import re
+
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform, RollPitchYaw
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.perception import DepthImageToPointCloud
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I
 from scipy.spatial import KDTree
@@ -137,7 +142,8 @@ def test_a_camera_that_delivers_nothing_is_recognised_and_the_others_work(nothin
     )
     np.testing.assert_array_equal(cloud, alone)
     assert counts["a"].valid == 120 * 160
-    assert counts["b"] == CameraCounts(valid=0, target=0, grasped=0)
+    problem = "delivered no depth: check the camera and its connection"
+    assert counts["b"] == CameraCounts(valid=0, target=0, grasped=0, problem=problem)
 
 
 def test_nothing_in_view_gives_empty_clouds():
@@ -232,6 +238,105 @@ def test_an_image_that_is_too_old_is_no_image():
     assert target.Eval(context).size() == 0 < size
 
 
+def _losses(cameras: dict, **options) -> dict[str, str]:
+    fusion = PointCloudFusion(dict.fromkeys(cameras, INFO), FusionConfig(**(WIDE | options)))
+    context = fusion.CreateDefaultContext()
+    for name, (depth, label, X_WC) in cameras.items():
+        fusion.GetInputPort(f"{name}.depth_image").FixValue(context, _depth(depth))
+        fusion.GetInputPort(f"{name}.label_image").FixValue(context, _label(label))
+        fusion.GetInputPort(f"{name}.pose").FixValue(context, X_WC)
+    return fusion.GetOutputPort("cloud_losses").Eval(context)
+
+
+def test_an_empty_cloud_names_its_true_cause():
+    depth, square = _plane_depth(ABOVE), _square()
+    lost = depth.copy()
+    lost[square == 1] = np.nan
+    stripes = np.where(np.arange(SHAPE[1]) % 3 == 0, square, 0).astype(np.int16)
+    away = ABOVE @ RigidTransform([0, 0, -5])
+    for options, cameras, reason in (
+        ({}, {"c": (depth, 0 * square, ABOVE)}, "no camera has pixels labelled 'target'"),
+        ({}, {"c": (lost, square, ABOVE)}, "2400 of 2400 pixels labelled 'target' have no depth"),
+        ({}, {"c": (depth, stripes, ABOVE)}, "800 of 800 pixels .* within 1 px of a jump"),
+        ({}, {"c": (depth, square, away)}, r"2204 of 2204 pixels .* outside fusion.crop_lower "
+         r".* at \[.*5.0\] to \[.*5.0\] m"),
+        ({"min_cluster": 10_000}, {"c": (depth, square, ABOVE)}, "groups of fewer than .* = 10000"),
+        ({"voxel_size": 0.1, "min_cluster": 1}, {"c": (depth, square, ABOVE)}, "2204 of 2204 "
+         "pixels .* fall into [0-9]+ voxels: fusion.voxel_size is 0.1 m"),
+    ):  # fmt: skip
+        assert re.search(reason, _losses(cameras, **options)["target"]), reason
+    small = np.zeros_like(square)
+    small[10:20, 10:20] = 1
+    losses = _losses({"c": (depth, small, ABOVE)}, voxel_size=0.002, erosion=0, min_cluster=1)
+    assert "only 100 pixels are labelled 'target'" in losses["target"]
+    assert "no camera has pixels labelled 'grasped'" in losses["grasped"]
+
+
+PROBLEMS = {
+    "millimetres": (lambda d, i, X: (1000 * d, i, X), "are they in mm"),
+    "twice": (lambda d, i, X: (d / 1000, i, X), "scaled twice"),
+    "nothing": (lambda d, i, X: (0 * d, i, X), "delivered no depth"),
+    "nearly": (
+        lambda d, i, X: (np.where(np.arange(160) < 0.6, d, 0), i, X),
+        "delivered a depth in",
+    ),
+    "small": (
+        lambda d, i, X: (d[::2], i, X),
+        "160 x 60 px, the scenario's intrinsics say 160 x 120",
+    ),
+    "mask": (lambda d, i, X: (d, 255 * i, X), r"labels \[255\] that are no roles"),
+    "NaN": (lambda d, i, X: (d, i, RigidTransform([np.nan, 0, 0])), "pose that isn't finite"),
+    "scaled": (
+        lambda d, i, X: (d, i, RigidTransform(RotationMatrix(1.01 * np.eye(3)), [0, 0, 0])),
+        "pose whose rotation is no rotation matrix",
+    ),
+    "mirrored": (
+        lambda d, i, X: (d, i, RigidTransform(RotationMatrix(-np.eye(3)), [0, 0, 0])),
+        "pose whose rotation is no rotation matrix",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_a_camera_with_a_problem_is_named_and_the_others_are_as_without_it(name: str):
+    change, reason = PROBLEMS[name]
+    depth = _plane_depth(ABOVE)
+    good = (depth, _square(), ABOVE)
+    alone, _, _ = _fuse({"a": good})
+    cloud, _, counts = _fuse({"a": good, "b": change(depth, _square(), ABOVE)}, minimum_valid=0.01)
+    np.testing.assert_array_equal(cloud, alone)
+    assert counts["a"].problem == "" and counts["b"].target == counts["b"].valid == 0
+    assert re.search(reason, counts["b"].problem), counts["b"].problem
+
+
+VALUES = st.sampled_from([0.0, -1.0, np.nan, np.inf, -np.inf, 1e-9, 0.5, 0.8, 20.1, 812.0, 3e38])
+
+
+@given(
+    arrays.arrays(np.float32, SHAPE, elements=VALUES, fill=VALUES),
+    arrays.arrays(np.int16, SHAPE, elements=st.integers(-2, 5), fill=st.integers(0, 2)),
+    arrays.arrays(np.float64, (3, 4), elements=st.floats()) | st.just(ABOVE.GetAsMatrix34()),
+    st.floats(),
+)
+@settings(max_examples=20)
+def test_whatever_a_camera_delivers_clouds_are_finite_and_in_the_box(depth, label, pose, time):
+    X_WC = RigidTransform(RotationMatrix(np.ascontiguousarray(pose[:, :3])), pose[:, 3])
+    fusion = PointCloudFusion({"c": INFO}, FusionConfig(**WIDE))
+    context = fusion.CreateDefaultContext()
+    for port, value in (("depth_image", _depth(depth)), ("label_image", _label(label))):
+        fusion.GetInputPort(f"c.{port}").FixValue(context, value)
+    fusion.GetInputPort("c.pose").FixValue(context, X_WC)
+    fusion.GetInputPort("c.time").FixValue(context, [time])
+    counts = fusion.GetOutputPort("camera_counts").Eval(context)["c"]
+    for name in ("target", "grasped"):
+        points = fusion.GetOutputPort(f"{name}_cloud").Eval(context).xyzs().T
+        assert np.isfinite(points).all()
+        assert (points >= np.array(WIDE["crop_lower"]) - 1e-5).all()
+        assert (points <= np.array(WIDE["crop_upper"]) + 1e-5).all()
+        if len(points) == 0:
+            assert counts.problem or fusion.GetOutputPort("cloud_losses").Eval(context)[name]
+
+
 def test_bad_settings_and_images_are_refused():
     with pytest.raises(FusionError, match="camera"):
         PointCloudFusion({})
@@ -239,6 +344,3 @@ def test_bad_settings_and_images_are_refused():
         PointCloudFusion({"c": INFO}, FusionConfig(voxel_size=0.0))
     with pytest.raises(ConfigError, match="crop"):
         PointCloudFusion({"c": INFO}, FusionConfig(crop_lower=[1, 1, 1], crop_upper=[0, 0, 0]))
-    small = np.ones((60, 80), dtype=np.float32)
-    with pytest.raises(FusionError, match=r"c\.depth_image: 80 x 60 px.*160 x 120"):
-        _fuse({"c": (small, _square(), ABOVE)})

@@ -132,5 +132,5 @@ def test_contact_torque_holds_only_if_it_lasts():
 
 
 def test_wrong_number_of_torque_limits_is_refused():
-    with pytest.raises(IgaDrakeError, match=r"torque_limit: .*7 numbers > 0"):
+    with pytest.raises(IgaDrakeError, match=r"torque_limit: .*7 numbers, one a joint"):
         Supervisor(panda_robot(), SupervisorConfig(torque_limit=[1.0]), period=0.005)

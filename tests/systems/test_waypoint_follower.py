@@ -5,6 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from control_fixtures import downward, panda_robot, panda_solver
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
@@ -240,6 +242,31 @@ def test_bad_targets_are_refused(bad, message):
     run.send(bad)
     with pytest.raises(IgaDrakeError, match=message):
         run.step()
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-6, 1e-3])
+def test_the_slowest_motion_does_not_jump(scale: float):
+    run = Run(linear_speed=0.25)
+    goal = RigidTransform(X_START.rotation(), X_START.translation() + np.array([0.3, 0, 0]))
+    run.send(EndEffectorTarget(1, goal, 0.08, 0.08, speed_scale=scale))
+    poses = run.step(50)
+    moved = np.linalg.norm(poses[-1].translation() - X_START.translation())
+    assert moved <= 0.25 * scale * 50 * STEP + 1e-12
+
+
+@given(st.floats(-4, 0), st.floats(-3, 1), st.floats(0.001, 0.5))
+@settings(max_examples=15)
+def test_a_motion_keeps_its_speed_and_arrives(scale: float, ramp: float, distance: float):
+    speed = 0.25 * 10**scale
+    run = Run(linear_speed=2.0, ramp=10**ramp)
+    goal = RigidTransform(X_START.rotation(), X_START.translation() + [distance, 0, 0])
+    run.send(EndEffectorTarget(1, goal, 0.08, 0.08, speed_scale=speed / 2.0))
+    steps = min(400, int(distance / speed / STEP + 2 * 10**ramp / STEP) + 10)
+    places = np.array([pose.translation()[0] for pose in run.step(steps)])
+    changes = np.diff(places)
+    assert (changes >= -1e-12).all() and (changes <= speed * STEP + 2e-6 * distance).all()
+    if steps < 400:
+        assert places[-1] == pytest.approx(goal.translation()[0], abs=1e-9)
 
 
 def test_bad_settings_are_refused():

@@ -24,9 +24,9 @@ from iga_drake.aligners.iga.descriptor import Description, DescriptorNet
 from iga_drake.aligners.iga.energy import PairEnergyNet, SearchConfig, minimise, pair_proposals
 from iga_drake.aligners.iga.node_clouds import NodeClouds, beside_clutter, drawn_points
 from iga_drake.aligners.iga.voting import Match, VotingConfig, cast_votes, match_objects, modes
-from iga_drake.aligners.protocol import AlignerError, PoseEstimate
+from iga_drake.aligners.protocol import AlignerError, PoseEstimate, check_question
 from iga_drake.checkpoint import file_digest, network_digest
-from iga_drake.demonstrations.alignment import Alignment, check_cloud, check_direction
+from iga_drake.demonstrations.alignment import Alignment, check_direction
 from iga_drake.geometry.se3 import inverse
 from iga_drake.paths import models_dir
 
@@ -208,9 +208,7 @@ class IgaAligner:
         `logits` takes the place of the learned matches: nodes (2, D + 1, M), as in
         `Explanation.index`, to logits (2, D, M, M).
         """
-        if not context:
-            raise AlignerError("iga: the context is empty: give at least one demonstration")
-        test_clouds = [check_cloud(grasped, "grasped"), check_cloud(target, "target")]
+        test_clouds = check_question("iga", context, grasped, target, seed=seed)
         times = [time.perf_counter()]
 
         def stage() -> None:

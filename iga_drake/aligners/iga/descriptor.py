@@ -279,19 +279,6 @@ class DescriptorNet(nn.Module):
             tuple(written),
         )
 
-    def mixed_precision(self) -> "DescriptorNet":
-        """In place: double precision for all that turns with the clouds, single for invariants.
-
-        For clouds in double precision. What is single doesn't depend on the clouds' frames.
-        """
-        self.float()
-        for module in self.modules():
-            if isinstance(module, VectorLinear):
-                module.double()
-        if self.config.local == "encoder":
-            self.local.encoder.double()  # type: ignore[operator, union-attr]
-        return self
-
     def similarity(self, a: Tensor, b: Tensor) -> Tensor:
         """Logits (..., M, N) of a match between descriptors (..., M, D) and (..., N, D)."""
         return self.log_temperature.clamp(max=4.6).exp() * (a @ b.transpose(-1, -2))

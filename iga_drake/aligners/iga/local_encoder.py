@@ -20,7 +20,7 @@ from iga_drake.aligners.iga.vector_neurons import (
     VectorLayer,
     VectorLinear,
 )
-from iga_drake.checkpoint import CheckpointError, load_checkpoint
+from iga_drake.checkpoint import load_network, sizes_in_card
 from iga_drake.geometry.clouds import furthest_point_sampling
 
 ENCODER = "encoder"
@@ -268,14 +268,12 @@ def load_encoder(path: Path) -> tuple[OccupancyNet, dict]:
 
     Raises `CheckpointError`.
     """
-    tensors, card = load_checkpoint(path, kind=ENCODER)
-    try:
-        net = OccupancyNet(EncoderConfig(**card["encoder"]), DecoderConfig(**card["decoder"]))
-        net.load_state_dict(tensors)
-    except (KeyError, TypeError, RuntimeError) as error:
-        raise CheckpointError(
-            f"{path}: card and tensors don't describe this release's encoder ({error}): train one "
-            "with `iga train encoder` or name another"
-        ) from error
-    net.eval().requires_grad_(False)
-    return net, card
+    return load_network(
+        path,
+        kind=ENCODER,
+        build=lambda card, _: OccupancyNet(
+            sizes_in_card(EncoderConfig, card["encoder"]),
+            sizes_in_card(DecoderConfig, card["decoder"]),
+        ),
+        remedy="train one with `iga train encoder` or name another",
+    )

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from iga_drake.aligners.protocol import AlignerError
 from iga_drake.geometry.clouds import own_frames
 from iga_drake.geometry.se3 import (
     inverse,
@@ -39,7 +40,8 @@ class VotingConfig:
     likeliest: int = 12
     # Whether the best one's half-turns about the principal axes are tried too.
     half_turns: bool = True
-    iterations: int = 3  # of refinement
+    iterations: int = 3  # of refinement, by the first nodes alone
+    refining: int = 32
     # Where up is known: no hypothesis tilts it by more, and all count less the more they do:
     # exp(-(tilt / sigma_tilt)^2 / 2) in the vote. rad.
     tilt: float = math.radians(45)
@@ -352,18 +354,20 @@ def global_hypotheses(
     columns, nodes = _after(y, config.coarse_sigma), x[:, None]
     S = X.shape[1]
 
-    def likely_matches() -> Tensor:  # (B, S M, N)
-        exponent = _before(transform(X, nodes).flatten(1, 2)) @ columns
-        exponent.view(B, S, M, N).add_(log_p[:, None])
+    def likely_matches(count: int) -> Tensor:  # (B, S count, N), of the first nodes
+        exponent = _before(transform(X, nodes[:, :, :count]).flatten(1, 2)) @ columns
+        exponent.view(B, S, count, N).add_(log_p[:, None, :count])
         return exponent.exp_()
 
+    some = min(M, config.refining)
     for _ in range(config.iterations):
-        sums = (likely_matches() @ with_one).view(B, S, M, 4)
+        sums = (likely_matches(some) @ with_one).view(B, S, some, 4)
         soft, likelihood = sums[..., :3] / sums[..., 3:].clamp_min(1e-37), _log(sums[..., 3])
         weight = (likelihood - likelihood.amax(-1, keepdim=True)).exp().clamp_min(1e-3).sqrt()
-        X = kabsch(nodes.expand(-1, S, -1, -1), soft, weight * share_x[:, None])
+        weight = weight * share_x[:, None, :some]
+        X = kabsch(nodes[:, :, :some].expand(-1, S, -1, -1), soft, weight)
         X = _upright(X, up, config.tilt)
-    likely = likely_matches().sum(-1).view(B, S, M)
+    likely = likely_matches(M).sum(-1).view(B, S, M)
     tilt = _tilt(X[..., :3, :3], up)
     score = (_log(likely) * share_x[:, None]).sum(-1) - config.tilt_penalty(tilt)
     flat = X[..., :3, :3].flatten(2)
@@ -555,22 +559,26 @@ def _as_points(R: Tensor, place: Tensor, config: VotingConfig) -> Tensor:
 
 def modes(votes: Votes) -> tuple[Tensor, Tensor]:
     """Clusters weighted poses: kernel density, mean shift from the densest, non-maximum
-    suppression. See `vote`."""
+    suppression. See `vote`. Raises `AlignerError` where the votes aren't finite."""
     X, log_weight, centre, config = votes.X, votes.log_weight, votes.centre, votes.config
     at = _as_points(X[:, :3, :3], transform(X, centre[None])[:, 0], config)  # (n, 12)
     weight = (log_weight - log_weight.max()).exp()
+    if not bool(weight.isfinite().all() and at.isfinite().all()):
+        raise AlignerError(
+            "iga: the votes for poses are not finite: are the clouds' sizes those of real objects?"
+        )
     single, share = at.float(), weight.float()
     columns = _after(single, 1.0)
     density = torch.cat([(_before(some) @ columns).exp_() @ share for some in single.split(128)])
-    alive = torch.ones(len(X), dtype=torch.bool)
+    alive = weight > 0  # the best one at least; each round ends one or more
     found: list[Tensor] = []
     energies: list[float] = []
     while len(found) < config.modes and alive.any():
-        seed = int(torch.where(alive, density, torch.zeros_like(density)).argmax())
+        seed = int(density.masked_fill(~alive, -1).argmax())
         mode = at[seed]
         for _ in range(3):
             near = (-0.5 * (at - mode).square().sum(-1)).exp() * weight
-            mode = near @ at / near.sum()
+            mode = near @ at / near.sum().clamp_min(torch.finfo(near.dtype).tiny)
             rotation = nearest_rotation(mode[:9].view(3, 3))
             mode[:9] = rotation.flatten() / (math.sqrt(2) * config.sigma_rotation)
         d2 = (at - mode).square().sum(-1)
@@ -580,7 +588,7 @@ def modes(votes: Votes) -> tuple[Tensor, Tensor]:
         found.append(mode)
         mass = float(((-0.5 * d2).exp() * weight).sum())
         energies.append(-math.log(mass + 1e-30) - float(log_weight.max()))
-        if energies[-1] > energies[0] + 6:
+        if not energies[-1] <= energies[0] + 6:
             break
     best = torch.stack(found)
     rotation = best[:, :9].view(-1, 3, 3) * (math.sqrt(2) * config.sigma_rotation)

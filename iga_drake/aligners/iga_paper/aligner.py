@@ -12,9 +12,9 @@ from iga_drake.aligners.iga_paper.langevin import LangevinConfig
 from iga_drake.aligners.iga_paper.model import PaperModel, kind_of, load_model
 from iga_drake.aligners.iga_paper.nodes import PaperProblem, problem
 from iga_drake.aligners.iga_paper.search import best, search_rotation, search_translation
-from iga_drake.aligners.protocol import AlignerError, PoseEstimate
+from iga_drake.aligners.protocol import AlignerError, PoseEstimate, check_question
 from iga_drake.checkpoint import file_digest, network_digest
-from iga_drake.demonstrations.alignment import Alignment, check_cloud
+from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.geometry.se3 import geodesic_angle, nearest_rotation
 from iga_drake.paths import models_dir
 
@@ -95,10 +95,8 @@ class Asked:
 
         Raises `AlignerError`, which begins with `name`.
         """
-        if not context:
-            raise AlignerError(f"{name}: the context is empty: give at least one demonstration")
-        pairs = [(a.grasped, a.target) for a in context]
-        pairs.append((check_cloud(grasped, "grasped"), check_cloud(target, "target")))
+        clouds_given = check_question(name, context, grasped, target, seed=seed)
+        pairs = [*((a.grasped, a.target) for a in context), clouds_given]
         # Near the origin, where single precision is enough: a demonstration as a whole, the test's
         # objects each by itself.
         shifts = [(pair[1].mean(0),) * 2 for pair in pairs]
@@ -191,9 +189,10 @@ class IgaPaperAligner:
     ) -> PoseEstimate:
         """See `Aligner.align`. Ways up are not used. The modes share the rotation; energies are the
         translation network's."""
-        config, generator = self.config, torch.Generator().manual_seed(seed)
+        config = self.config
         options = {"points": config.points, "seed": seed, "name": self.name}
         asked = Asked.of(self.rotation, context, grasped, target, **options)  # type: ignore[arg-type]
+        generator = torch.Generator().manual_seed(seed)
         known = asked.problem.context(self.rotation.graph)
         start = asked.problem.offset()
         turned, E = search_rotation(self.rotation.graph, known, start, config.rotation, generator)

@@ -57,7 +57,7 @@ class GraphConfig:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if field.name != "spectral" and value <= 0:
+            if field.name != "spectral" and not value > 0:
                 raise GraphError(f"GraphConfig.{field.name} = {value}, must be above 0")
 
     @property

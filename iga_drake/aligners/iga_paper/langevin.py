@@ -39,7 +39,7 @@ class LangevinConfig:
 
     def __post_init__(self) -> None:
         for name, least in (("particles", 1), ("steps", 0)):
-            if getattr(self, name) < least:
+            if not getattr(self, name) >= least:
                 raise SamplerError(
                     f"LangevinConfig.{name} = {getattr(self, name)}, must be at least {least}"
                 )

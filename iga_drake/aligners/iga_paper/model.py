@@ -9,7 +9,13 @@ from torch import Tensor, nn
 from iga_drake.aligners.iga.local_encoder import EncoderConfig, LocalEncoder
 from iga_drake.aligners.iga_paper.graph import GraphConfig, GraphNetwork, Nodes
 from iga_drake.aligners.iga_paper.nodes import encode
-from iga_drake.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from iga_drake.checkpoint import (
+    CheckpointError,
+    load_checkpoint,
+    load_network,
+    save_checkpoint,
+    sizes_in_card,
+)
 
 # The parts that are trained, and how many numbers each network puts out: energies of rotations
 # or of translations; the transform itself (DirReg); its distance to the right one (DFM).
@@ -37,9 +43,11 @@ class PaperModel(nn.Module):
 
     @staticmethod
     def described(card: dict) -> "PaperModel":
-        """An untrained model of the sizes in a card. Raises KeyError or TypeError."""
+        """An untrained model of the sizes in a card. Raises KeyError and `CheckpointError`."""
         return PaperModel(
-            card["part"], GraphConfig(**card["model"]), EncoderConfig(**card["encoder"])
+            card["part"],
+            sizes_in_card(GraphConfig, card["model"]),
+            sizes_in_card(EncoderConfig, card["encoder"]),
         )
 
     def description(self) -> dict:
@@ -59,14 +67,14 @@ class PaperModel(nn.Module):
 
 def load_model(path: Path, part: str) -> tuple[PaperModel, dict]:
     """The trained model (evaluation mode) of a part, and its card. Raises `CheckpointError`."""
-    tensors, card = load_checkpoint(path, kind=kind_of(part))
-    try:
-        return PaperModel.described(card).with_weights(tensors), card
-    except (KeyError, TypeError, RuntimeError) as error:
-        raise CheckpointError(
-            f"{path}: card and tensors don't describe this release's network ({error}): train one "
-            f"with `iga train paper --part {part}` or name another"
-        ) from error
+    model, card = load_network(
+        path,
+        kind=kind_of(part),
+        build=lambda card, _: PaperModel.described(card),
+        remedy=f"train one with `iga train paper --part {part}` or name another",
+    )
+    model.graph.power_iteration(SETTLED)
+    return model, card
 
 
 def write_half(source: Path, destination: Path, part: str) -> None:

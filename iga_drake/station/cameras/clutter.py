@@ -8,7 +8,7 @@ from pydrake.systems.framework import LeafSystem, ValueProducer
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I
 from scipy.spatial import cKDTree
 
-from iga_drake.errors import check_range
+from iga_drake.errors import check_bounds, check_range
 from iga_drake.systems.fusion import pixel_rays, unreliable_pixels
 from iga_drake.systems.ports import Role
 
@@ -32,10 +32,9 @@ class Clutter:
 
     def check(self, where: str = "clutter") -> None:
         """Raises `ConfigError` for a value out of range."""
-        check_range(self.ring >= 0, f"{where}.ring", self.ring, ">= 0")
         check_range(0 <= self.stray < 1, f"{where}.stray", self.stray, "0 <= stray < 1")
-        for name in ("patch", "spread"):
-            check_range(getattr(self, name) > 0, f"{where}.{name}", getattr(self, name), "> 0")
+        bounds = {"ring": (0.0, 1.0), "patch": (1e-4, 1.0), "spread": (1e-4, 10.0)}
+        check_bounds(self, where, bounds)
 
     @property
     def any(self) -> bool:

@@ -11,7 +11,7 @@ from pydrake.systems.framework import LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
 from iga_drake.dataset.depth_noise import DepthNoise, noisy_depth
-from iga_drake.errors import check_range
+from iga_drake.errors import check_bounds, check_range
 
 
 @dataclass
@@ -34,7 +34,8 @@ class CalibrationError:
     def check(self, where: str) -> None:
         """Raises `ConfigError` for a value out of range."""
         check_range(len(self.center) == 3, f"{where}.center", self.center, "3 numbers")
-        check_range(self.radius > 0, f"{where}.radius", self.radius, "> 0")
+        bounds = {"maximum": (0.0, 1.0), "center": (-10.0, 10.0), "radius": (1e-3, 10.0)}
+        check_bounds(self, where, bounds)
         least, most = self.minimum, self.maximum
         check_range(0 <= least <= most, f"{where}.minimum", least, f"0..maximum = {most}")
         turn = (most - least) / 2 / self.radius

@@ -22,11 +22,12 @@ from pydrake.systems.primitives import ConstantValueSource
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
 from iga_drake.dataset.depth_noise import DepthNoise
-from iga_drake.errors import check_range
+from iga_drake.errors import check_bounds, check_range
 from iga_drake.station.cameras.noise import CalibrationError, CameraNoise, calibration_error
 
 _RENDERER = "vtk"
 _CLIPPING = (0.01, 10.0)  # m, of the renderer
+_FARTHEST = 20.0  # m, of a camera from the robot along each axis
 
 
 @dataclass
@@ -95,16 +96,27 @@ class RgbdCamera:
         for name, size in vectors.items():
             value = getattr(pose, name)
             check_range(len(value) == size, f"{where}.pose.{name}", value, f"{size} numbers")
+            most = 2 * math.pi if name == "rpy" else _FARTHEST
+            check_bounds(pose, f"{where}.pose", {name: (-most, most)})
         if isinstance(pose, LookAt):
             sideways = math.dist(pose.position[:2], pose.target[:2])
             check_range(
                 sideways > 1e-6, f"{where}.pose.target", pose.target, "not above or below position"
             )
-        for name in ("width", "height", "fx", "fy"):
+        within = f"{where}.intrinsics"
+        check_bounds(k, within, {"width": (8, 4096), "height": (8, 4096)})
+        # Fields of view from 0.6 to 169 degrees; the renderer takes the principal point half a
+        # pixel further (`rendering_info`).
+        check_bounds(k, within, {"fx": (k.width / 20, 100 * k.width)})
+        check_bounds(k, within, {"fy": (k.height / 20, 100 * k.height)})
+        for name, size in (("cx", k.width), ("cy", k.height)):
             value = getattr(k, name)
-            check_range(value > 0, f"{where}.intrinsics.{name}", value, "> 0")
-        check_range(0 < k.cx < k.width, f"{where}.intrinsics.cx", k.cx, "inside the image")
-        check_range(0 < k.cy < k.height, f"{where}.intrinsics.cy", k.cy, "inside the image")
+            check_range(
+                0 < value <= size - 1,
+                f"{within}.{name}",
+                value,
+                f"inside the image, up to {size - 1}",
+            )
         near, far = self.near, self.far
         check_range(
             _CLIPPING[0] <= near < far <= _CLIPPING[1],
@@ -113,7 +125,7 @@ class RgbdCamera:
             f"{_CLIPPING[0]} <= near < far <= {_CLIPPING[1]} m, what the renderer can do",
         )
         period = self.frame_period
-        check_range(period > 0, f"{where}.frame_period", period, "> 0")
+        check_range(1e-4 <= period <= 60, f"{where}.frame_period", period, "0.0001 to 60")
         self.noise.check(f"{where}.noise")
         self.calibration.check(f"{where}.calibration")
 

@@ -1,7 +1,5 @@
 """The descriptor network: invariances by axiom, over random clouds."""
 
-import copy
-
 import pytest
 import torch
 
@@ -38,17 +36,6 @@ def test_invariant_under_rigid_motions(net: DescriptorNet, cloud) -> None:
     torch.testing.assert_close(
         described(net, moved, nodes), described(net, points, nodes), atol=1e-6, rtol=0
     )
-
-
-def test_mixed_precision_is_the_same_and_invariant(net: DescriptorNet, cloud) -> None:
-    points, nodes = cloud
-    mixed = copy.deepcopy(net).mixed_precision()
-    found = described(mixed, points, nodes)
-    assert found.dtype == torch.float32
-    torch.testing.assert_close(found.double(), described(net, points, nodes), atol=1e-5, rtol=0)
-    R = random_rotations(4, generator=torch.Generator().manual_seed(2))
-    moved = points @ R.transpose(1, 2) + torch.randn(4, 1, 3, dtype=torch.float64)
-    torch.testing.assert_close(described(mixed, moved, nodes), found, atol=2e-6, rtol=0)
 
 
 def test_follows_a_permutation_of_points_and_nodes(net: DescriptorNet, cloud) -> None:

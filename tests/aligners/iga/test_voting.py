@@ -5,16 +5,21 @@ import math
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
 from iga_drake.aligners.iga.voting import (
+    Votes,
     VotingConfig,
     draw_triplets,
     fit_triangles,
     match_objects,
+    modes,
     principal_half_turns,
     vote,
 )
+from iga_drake.aligners.protocol import AlignerError
 from iga_drake.dataset.samples import make_sample
 from iga_drake.geometry.clouds import furthest_point_sampling
 from iga_drake.geometry.se3 import (
@@ -216,7 +221,7 @@ def test_up_chooses_among_half_turns() -> None:
     assert float(unknown.abs().diagonal().sum()) == pytest.approx(3, abs=1e-3)  # one of the four
     tilts, best = found(up @ start[:3, :3].T)
     assert (tilts > math.cos(CONFIG.tilt) - 1e-4).all()
-    torch.testing.assert_close(best, torch.eye(3).double(), atol=1e-3, rtol=0)
+    torch.testing.assert_close(best, torch.eye(3).double(), atol=1e-2, rtol=0)
     # The other way up: another of the four.
     turned = up * torch.tensor([-1.0, 1.0, -1.0])
     tilts, best = found(turned @ start[:3, :3].T)
@@ -272,3 +277,36 @@ def test_scaled_lengths_give_the_scaled_answer() -> None:
     torch.testing.assert_close(scaled[0, :3, :3], X[0, :3, :3], atol=1e-4, rtol=0)
     torch.testing.assert_close(scaled[0, :3, 3], 1.7 * X[0, :3, 3], atol=1e-4, rtol=0)
     torch.testing.assert_close(again[0], energy[0], atol=1e-3, rtol=0)
+
+
+def _votes(log_weight: list[float], spread: float) -> Votes:
+    n = len(log_weight)
+    generator = torch.Generator().manual_seed(n)
+    place = spread * torch.randn(n, 3, generator=generator, dtype=torch.float64)
+    X = rigid(random_rotations(n, generator=generator), place)
+    weight = torch.tensor(log_weight, dtype=torch.float64)
+    pair = torch.zeros(n, dtype=torch.long)
+    return Votes(X, weight, pair, (1, 1), torch.zeros(3).double(), (1, 1, n), CONFIG)
+
+
+@given(
+    st.lists(st.floats(-1e6, 1e3), min_size=1, max_size=12),
+    st.sampled_from([0.0, 0.01, 1.0, 1e4]),
+)
+def test_the_search_for_modes_ends_whatever_the_weights_are(log_weight, spread) -> None:
+    votes = _votes(log_weight, spread)
+    poses, energies = modes(votes)
+    assert 1 <= len(poses) <= CONFIG.modes
+    assert poses.isfinite().all() and (energies.diff() >= 0).all()
+    if spread == 1e4:  # each by itself
+        assert float(energies[0]) == pytest.approx(-max(log_weight), abs=1e-6)
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
+def test_votes_that_are_not_finite_are_refused(wrong: float) -> None:
+    with pytest.raises(AlignerError, match="votes for poses are not finite"):
+        modes(_votes([wrong], 1.0))
+    votes = _votes([0.0, 0.0], 1.0)
+    votes.X[0, 0, 3] = math.nan
+    with pytest.raises(AlignerError, match="votes for poses are not finite"):
+        modes(votes)

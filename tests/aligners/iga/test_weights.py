@@ -1,14 +1,20 @@
 """Weights that are whole, and files whose card and tensors don't belong together."""
 
 import dataclasses
+import math
+import tempfile
 from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from iga_drake.aligners.iga.aligner import IgaAligner
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
-from iga_drake.aligners.iga.weights import DESCRIPTOR, load_descriptor
+from iga_drake.aligners.iga.energy import PairEnergyNet
+from iga_drake.aligners.iga.weights import DESCRIPTOR, ENERGY, load_descriptor
+from iga_drake.aligners.registry import make_aligner
 from iga_drake.checkpoint import CheckpointError, save_checkpoint
 
 CONFIG = DescriptorConfig(layers=1, scalars=16, vectors=4, heads=2)
@@ -33,6 +39,59 @@ def test_a_card_of_another_network_is_refused(tmp_path: Path, change: dict | Non
     path = write(tmp_path / "x.safetensors", model)
     with pytest.raises(CheckpointError, match=r"x\.safetensors: card and tensors"):
         load_descriptor(path)
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path, wrong: float) -> None:
+    tensors = DescriptorNet(CONFIG).state_dict()
+    name = sorted(tensors)[3]
+    tensors[name].view(-1)[0] = wrong
+    path = tmp_path / "x.safetensors"
+    save_checkpoint(path, tensors, kind=DESCRIPTOR, card={"model": dataclasses.asdict(CONFIG)})
+    with pytest.raises(CheckpointError, match=rf"x\.safetensors: '{name}' holds numbers that are"):
+        load_descriptor(path)
+
+
+FIELDS = st.sampled_from([field.name for field in dataclasses.fields(DescriptorConfig)])
+VALUES = st.sampled_from(
+    [
+        None,
+        True,
+        -1,
+        0,
+        1.5,
+        10**9,
+        10**30,
+        "16",
+        [],
+        {},
+        [1.0],
+        [math.nan],
+        [10**6] * 5000,
+        "x" * 9,
+    ]
+)
+
+
+@given(st.dictionaries(FIELDS, VALUES, min_size=1, max_size=3) | VALUES)
+def test_any_card_is_refused_or_describes_the_network(change) -> None:
+    model = dataclasses.asdict(CONFIG) | change if isinstance(change, dict) else change
+    with tempfile.TemporaryDirectory() as folder:
+        path = write(Path(folder) / "x.safetensors", model)
+        try:
+            assert load_descriptor(path)[0].config == CONFIG
+        except CheckpointError as error:
+            assert "card and tensors" in str(error) and len(str(error)) < 3000
+
+
+def test_an_energy_of_nan_makes_no_aligner(tmp_path: Path) -> None:
+    net = PairEnergyNet()
+    net.familiar_bias.data.fill_(math.nan)
+    path = tmp_path / "energy.safetensors"
+    card = {"model": dataclasses.asdict(net.config)}
+    save_checkpoint(path, net.state_dict(), kind=ENERGY, card=card)
+    with pytest.raises(CheckpointError, match="'familiar_bias' holds numbers that are not finite"):
+        make_aligner("iga", energy=str(path))
 
 
 def test_an_aligner_leaves_the_network_it_is_given_alone() -> None:
