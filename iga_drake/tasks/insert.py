@@ -27,7 +27,7 @@ from iga_drake.tasks.predicates import (
     Touching,
     Upright,
 )
-from iga_drake.tasks.snapshots import ROBOT, TABLE
+from iga_drake.tasks.snapshots import ROBOT, TABLE, TaskError
 from iga_drake.tasks.task import Split, Task
 
 TARGET, HELD = "target", "grasped"
@@ -73,6 +73,7 @@ _BOTTLE = {
     "cap_taper": (0.9, 1.0),
     "cap_height": (0.02, 0.03),
 }
+_MOST_DRAWS = 1000
 _SHOE_MASS, _BOTTLE_MASS = (0.3, 0.5), (0.08, 0.16)  # kg
 _FRICTION = (0.5, 0.8)
 _COLORS = ((0.2, 0.45, 0.3), (0.25, 0.4, 0.62), (0.7, 0.35, 0.15), (0.5, 0.5, 0.52))
@@ -167,7 +168,7 @@ class Insert(Task):
     def make_shapes(seed: int) -> Mapping[str, ShapeInstance]:
         """Draws a shoe and a bottle until the bottle fits."""
         rng = np.random.default_rng(seed)
-        while True:
+        for _ in range(_MOST_DRAWS):
             family = str(rng.choice(sorted(_FOOTWEAR)))
             shoe = draw_parameters(family, _FOOTWEAR[family], rng)
             bottle = draw_parameters("bottle", _BOTTLE, rng)
@@ -179,6 +180,7 @@ class Insert(Task):
                     TARGET: target.with_mass(rng.uniform(*_SHOE_MASS)),
                     HELD: held.with_mass(rng.uniform(*_BOTTLE_MASS)),
                 }
+        raise TaskError(f"seed {seed}: none of {_MOST_DRAWS} bottles fits into its shoe")
 
     def arrange(self, truth: SceneTruth, rng: np.random.Generator, mesh_folder: Path) -> Scene:
         shapes = truth.shapes

@@ -27,7 +27,7 @@ from iga_drake.tasks.predicates import (
     Touching,
     Upright,
 )
-from iga_drake.tasks.snapshots import ROBOT, TABLE
+from iga_drake.tasks.snapshots import ROBOT, TABLE, TaskError
 from iga_drake.tasks.task import Split, Task
 
 TARGET, HELD = "target", "grasped"
