@@ -67,7 +67,11 @@ def test_scenes_are_a_function_of_their_seed(task: Task, tmp_path: Path) -> None
 def test_yaws_go_all_the_way_round(task: Task, tmp_path: Path) -> None:
     scenes = [task.scene(seed, mesh_folder=tmp_path) for seed in range(24)]
     yaws = [RollPitchYaw(scene.objects[0].X_WO.rotation()).yaw_angle() for scene in scenes]
-    assert set(np.floor(np.array(yaws) / (np.pi / 2))) == {-2, -1, 0, 1}
+    quarters = set(np.floor(np.array(yaws) / (np.pi / 2)))
+    if task.name == "pour":  # from one side alone: the hand doesn't reach round the mug
+        assert quarters == {-2, -1}
+    else:
+        assert quarters == {-2, -1, 0, 1}
 
 
 def test_unknown_names_are_refused_with_the_known_ones(task: Task) -> None:
