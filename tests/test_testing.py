@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from iga_drake import cli
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation import task_success
 from iga_drake.testing import assert_success
@@ -62,3 +63,12 @@ def test_bad_input_is_refused_before_anything_runs(
     with pytest.raises(IgaDrakeError, match=words):
         assert_success("stack", **({"seeds": [0], "at_least": 1.0} | change))
     assert not episodes
+
+
+@pytest.mark.parametrize(("rate", "status"), [("0.5", 0), ("0.6", 1), ("1.5", 2)])
+def test_the_command_ends_with_one_where_too_few_succeed(
+    episodes: list[list[str]], rate: str, status: int
+) -> None:
+    command = ["evaluate", "tasks", "--tasks", "stack", "--trials", "4", "--aligner", "iga"]
+    assert cli.main([*command, "--at-least", rate]) == status
+    assert len(episodes) == (0 if status == 2 else 4)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from iga_drake.aligners.registry import EXPERT
 from iga_drake.cli.options import add_aligner_options, aligner_options, names, seed
 from iga_drake.cli.scenarios import add_overlay_arguments, scenario_of, with_aligner
-from iga_drake.cli.status import INTERNAL, SUCCESS, CommandError
+from iga_drake.cli.status import FAILURE, INTERNAL, SUCCESS, CommandError
 
 if TYPE_CHECKING:
     from iga_drake.evaluation.task_success import Trial, TrialResult
@@ -28,6 +28,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--split", choices=("test", "demonstration"), default="test")
     parser.add_argument("--processes", type=int, default=1, help="episodes at a time")
     parser.add_argument("--results", type=Path, help="results file to append to and to go on from")
+    parser.add_argument(
+        "--at-least", type=float, metavar="RATE",
+        help="end with 1 where a scenario succeeds less often with one of the aligners, in [0, 1]",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
@@ -41,6 +45,8 @@ def run(arguments: argparse.Namespace) -> int:
     for option in ("tasks", "aligner"):
         if not getattr(arguments, option):
             raise CommandError(f"--{option}: empty, at least one name is needed")
+    if arguments.at_least is not None and not 0 <= arguments.at_least <= 1:
+        raise CommandError(f"--at-least {arguments.at_least}: must lie in [0, 1]")
     store = ResultsStore(arguments.results) if arguments.results else None
     trials = _trials(arguments)
     try:
@@ -49,13 +55,16 @@ def run(arguments: argparse.Namespace) -> int:
         if store:
             print(f"results so far are in {store.path}", file=sys.stderr)
         raise
+    summary = summarise_trials(results)
     if arguments.json:
-        document = {"summary": summarise_trials(results), "trials": [asdict(r) for r in results]}
+        document = {"summary": summary, "trials": [asdict(r) for r in results]}
         print(json.dumps(document, indent=2))
     else:
         print(format_table(results))
     if any(result.cause == BROKEN for result in results):
         return INTERNAL
+    if arguments.at_least is not None and any(r["rate"] < arguments.at_least for r in summary):
+        return FAILURE
     return SUCCESS
 
 
