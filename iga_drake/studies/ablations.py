@@ -105,12 +105,12 @@ class Variant:
 
 
 VARIANTS = (
-    Variant("vote-alone", INFERENCE, "default: vote of 32 test nodes, 64 dense nodes"),
+    Variant("vote-alone", INFERENCE, "default: vote of 32 test nodes, 96 dense nodes"),
     Variant("both", INFERENCE, "energy ranks and refines, the vote among it", {"search": "both"}),
     Variant("energy-alone", INFERENCE, "energy's own proposals alone", {"search": "energy"}),
     *(
         Variant(f"nodes-{n}", INFERENCE, f"{n} dense nodes", {"aligner": {"nodes": n}})
-        for n in (32, 96, 128)
+        for n in (32, 64, 128)
     ),
     *(
         Variant(

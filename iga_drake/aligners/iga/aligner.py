@@ -51,7 +51,7 @@ class IgaConfig:
     # surroundings are left out and the rest of the cloud is described anew.
     clutter: float = 0.1
     # Nodes with descriptors per object; at most the distinct points of the smallest cloud.
-    nodes: int = 64
+    nodes: int = 96
     # Places and ranks the poses: "vote" (its agreement), or "energy" (the learned one).
     ranking: str = "vote"
     # Modes below this share of the best one's probability are left out.
