@@ -93,8 +93,8 @@ class PoseEstimate:
 
     @staticmethod
     def of(found: Any) -> "PoseEstimate":
-        """What an aligner returned, whatever it is, as an estimate. Raises `AlignerError` for what
-        is none."""
+        """Checks what an aligner returned and makes an estimate of it. Raises `AlignerError` where a
+        field is missing, not finite or of a wrong shape."""
         missing = [name for name in ("poses", *_WEIGHTS) if not hasattr(found, name)]
         if missing:
             raise AlignerError(

@@ -1,5 +1,5 @@
-"""What cameras in the field do to clouds of objects: parts that are missing, points that are not
-the object's.
+"""Disturbances of observed clouds as in the field: holes, half views, stray points, table,
+fingers, a neighbour.
 
 A cloud here is points (n, 3) m with their `source` (n,): indices of the observed cloud's points
 that they come from, `CLUTTER` for points that are not the object's. Every function takes a cloud

@@ -112,8 +112,10 @@ class Sample:
 
     @cached_property
     def found_symmetries(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of the test pair's A and B, in W: motions (n, 4, 4) that carry the surface onto itself,
-        found in `surface`; the identity is the first, and the only one where there is none.
+        """Symmetries of the test pair's A and of its B that were found in `surface`: motions (n, 4, 4)
+        in W that carry the surface onto itself, the identity first.
+
+        Without a `surface` there is the identity alone.
 
         Instances of a composite are one form under deformations that tell nothing of it: what
         carries the canonical one onto itself counts as well, as near as the test instance has it.

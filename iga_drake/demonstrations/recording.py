@@ -58,11 +58,11 @@ class Recording:
             )
 
     def done(self, seed: int) -> bool:
-        """Whether this attempt was made."""
+        """Tells whether the attempt with this seed is over, with success or without."""
         return self._failed(seed).exists() or self._kept(seed).exists()
 
     def get(self, seed: int) -> Demonstration | None:
-        """What an attempt that was made left; None where it failed."""
+        """The demonstration of an attempt that is over; None where the attempt failed."""
         if self._failed(seed).exists():
             return None
         return read_demonstrations(self._kept(seed), task=self._task).demonstrations[0]

@@ -144,8 +144,15 @@ HEADER = f"{'aligner':<8} {'set':<24} {'count':>5}  {'error':<6}  {COLUMNS}   s"
 def sample_query(
     sample: Sample, split: str, index: int, *, up: bool = False, field: str = ""
 ) -> Query:
-    """What an aligner is asked about sample `index` of a set: with the objects' ways up, where they
-    have one, if `up`; with its clouds as in one of FIELD_KINDS, if `field`."""
+    """The query about sample `index` of a set that every aligner gets.
+
+    Args:
+      sample: the sample itself.
+      split: the name of its set.
+      index: of the sample.
+      up: give the directions that are up, of the objects that have one.
+      field: disturb the clouds in this way, one of FIELD_KINDS; none: clean clouds.
+    """
     A, B = (each if up and each.any(1).all() else None for each in sample.up.astype(np.float64))
     start = random_pose(index)
     query = Query.of(sample.points, start, grasped_up=A, target_up=B)
