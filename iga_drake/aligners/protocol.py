@@ -93,8 +93,10 @@ class PoseEstimate:
 
     @staticmethod
     def of(found: Any) -> "PoseEstimate":
-        """Checks what an aligner returned and makes an estimate of it. Raises `AlignerError` where a
-        field is missing, not finite or of a wrong shape."""
+        """Checks what an aligner returned and makes an estimate of it.
+
+        Raises `AlignerError` where a field is missing, not finite or of a wrong shape.
+        """
         missing = [name for name in ("poses", *_WEIGHTS) if not hasattr(found, name)]
         if missing:
             raise AlignerError(

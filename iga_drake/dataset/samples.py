@@ -112,8 +112,8 @@ class Sample:
 
     @cached_property
     def found_symmetries(self) -> tuple[np.ndarray, np.ndarray]:
-        """Symmetries of the test pair's A and of its B that were found in `surface`: motions (n, 4, 4)
-        in W that carry the surface onto itself, the identity first.
+        """Symmetries of the test pair's A and of its B that were found in `surface`: motions
+        (n, 4, 4) in W that carry the surface onto itself, the identity first.
 
         Without a `surface` there is the identity alone.
 
