@@ -1,7 +1,6 @@
 """Hang: hang the cap in the hand on the hook of a stand."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -14,7 +13,13 @@ from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.panda.model import HOME_POSITION
 from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
-from iga_drake.tasks.holding import centred_grip, draw_parameters, end_effector_pose, wrist_turn
+from iga_drake.tasks.holding import (
+    centred_grip,
+    draw_parameters,
+    end_effector_pose,
+    holding_scene,
+    wrist_turn,
+)
 from iga_drake.tasks.placement import WorkArea
 from iga_drake.tasks.predicates import (
     AllOf,
@@ -234,11 +239,13 @@ class Hang(Task):
             )
             for i, name in enumerate((TARGET, HELD))
         )
-        return Scene(
-            objects=objects,
-            panda_position=self.observe_posture.copy(),
-            hand_opening=opening + 0.0002,
-            truth=replace(truth, X_EO={HELD: X_EO}),
+        return holding_scene(
+            objects,
+            self.observe_posture,
+            held=HELD,
+            X_EO=X_EO,
+            opening=opening,
+            truth=truth,
         )
 
     @staticmethod

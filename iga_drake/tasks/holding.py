@@ -1,6 +1,7 @@
 """Objects in the hand at the start: where the hand is, and how far it opens around them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,9 +12,11 @@ from scipy.optimize import linprog
 from iga_drake.shapes.families import FAMILIES
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.station.panda.model import add_panda
+from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
 from iga_drake.tasks.snapshots import TaskError
 
 _PAD = 0.009  # m, half edge of a pad
+_LOOSE = 0.0002  # m, wider than what is held: the pads close on it at the first step
 
 
 def draw_parameters(
@@ -44,6 +47,33 @@ def _end_effector_pose(posture: tuple[float, ...]) -> RigidTransform:
     context = plant.CreateDefaultContext()
     panda.set_position(context, posture)
     return panda.X_WE(context)
+
+
+def holding_scene(
+    objects: Sequence[SceneObject],
+    posture: np.ndarray,
+    *,
+    held: str,
+    X_EO: RigidTransform,
+    opening: float,
+    truth: SceneTruth,
+) -> Scene:
+    """The scene of an arm with its joints at `posture` (7,) (rad) and an object in the hand.
+
+    Args:
+      objects: all of the scene, the one in the hand too.
+      posture: joint angles.
+      held: the name of the object in the hand.
+      X_EO: where that object is in the hand.
+      opening: the pads' distance (m) when they touch it, as `centred_grip` gives it.
+      truth: of the scene; where the object is in the hand is added.
+    """
+    return Scene(
+        objects=tuple(objects),
+        panda_position=posture.copy(),
+        hand_opening=opening + _LOOSE,
+        truth=replace(truth, X_EO={held: X_EO}),
+    )
 
 
 def wrist_turn(X_WE: RigidTransform) -> float:

@@ -1,7 +1,6 @@
 """Insert: put the bottle in the hand into the shoe on the table."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -14,7 +13,13 @@ from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.panda.model import HOME_POSITION
 from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
-from iga_drake.tasks.holding import centred_grip, draw_parameters, end_effector_pose, wrist_turn
+from iga_drake.tasks.holding import (
+    centred_grip,
+    draw_parameters,
+    end_effector_pose,
+    holding_scene,
+    wrist_turn,
+)
 from iga_drake.tasks.placement import TRIES, WorkArea
 from iga_drake.tasks.predicates import (
     AllOf,
@@ -198,14 +203,16 @@ class Insert(Task):
         bottle = write_sdf(shapes[HELD], mesh_folder, name=HELD, color=color, friction=friction[1])
         X_WT = _WORK_AREA.draw_pose(rng, shapes[TARGET].frames["opening"][:3, 3])
         X_WO_held = end_effector_pose(self.observe_posture) @ X_EO
-        return Scene(
-            objects=(
+        return holding_scene(
+            (
                 SceneObject(TARGET, "target", shoe, X_WT),
                 SceneObject(HELD, "grasped", bottle, X_WO_held),
             ),
-            panda_position=self.observe_posture.copy(),
-            hand_opening=opening + 0.0002,
-            truth=replace(truth, X_EO={HELD: X_EO}),
+            self.observe_posture,
+            held=HELD,
+            X_EO=X_EO,
+            opening=opening,
+            truth=truth,
         )
 
     def expert(

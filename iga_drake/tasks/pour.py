@@ -1,7 +1,6 @@
 """Pour: tip a marble out of the vessel in the hand into the mug on the table."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -13,7 +12,7 @@ from iga_drake.shapes.families import FAMILIES
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
-from iga_drake.tasks.holding import centred_grip, end_effector_pose
+from iga_drake.tasks.holding import centred_grip, end_effector_pose, holding_scene
 from iga_drake.tasks.marbles import make_marble, marble_object
 from iga_drake.tasks.placement import TRIES, WorkArea
 from iga_drake.tasks.predicates import (
@@ -195,15 +194,17 @@ class Pour(Task):
         floor = shapes[HELD].part_vertices("floor")[:, 2].max()
         radius = shapes[MARBLE].parameters["diameter"] / 2
         X_WM = RigidTransform(X_WH.multiply(np.array([0.0, 0.0, floor + radius + 0.001])))
-        return Scene(
-            objects=(
+        return holding_scene(
+            (
                 SceneObject(TARGET, "target", sdf(TARGET, 0), X_WT),
                 SceneObject(HELD, "grasped", sdf(HELD, 1), X_WH),
                 marble_object(MARBLE, shapes[MARBLE], _MARBLE_COLOR, X_WM),
             ),
-            panda_position=self.observe_posture.copy(),
-            hand_opening=opening + 0.0002,
-            truth=replace(truth, X_EO={HELD: X_EO}),
+            self.observe_posture,
+            held=HELD,
+            X_EO=X_EO,
+            opening=opening,
+            truth=truth,
         )
 
     def expert(

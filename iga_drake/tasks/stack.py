@@ -1,7 +1,6 @@
 """Stack: put the bowl in the hand into the bowl on the table."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -14,7 +13,7 @@ from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.panda.model import HOME_POSITION
 from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
-from iga_drake.tasks.holding import centred_grip, end_effector_pose
+from iga_drake.tasks.holding import centred_grip, end_effector_pose, holding_scene
 from iga_drake.tasks.nesting import nesting_height, release_height
 from iga_drake.tasks.placement import TRIES, WorkArea
 from iga_drake.tasks.predicates import (
@@ -146,11 +145,13 @@ class Stack(Task):
             SceneObject(TARGET, "target", sdf(TARGET, 0), _WORK_AREA.draw_pose(rng)),
             SceneObject(HELD, "grasped", sdf(HELD, 1), X_WO_held),
         )
-        return Scene(
-            objects=objects,
-            panda_position=self.observe_posture.copy(),
-            hand_opening=opening + 0.0002,
-            truth=replace(truth, X_EO={HELD: X_EO}),
+        return holding_scene(
+            objects,
+            self.observe_posture,
+            held=HELD,
+            X_EO=X_EO,
+            opening=opening,
+            truth=truth,
         )
 
     def expert(

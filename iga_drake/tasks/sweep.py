@@ -1,7 +1,6 @@
 """Sweep: push marbles into a dustpan with the brush in the hand."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -15,7 +14,7 @@ from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.panda.model import HOME_POSITION, gripper_cloud
 from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
-from iga_drake.tasks.holding import centred_grip, end_effector_pose
+from iga_drake.tasks.holding import centred_grip, end_effector_pose, holding_scene
 from iga_drake.tasks.marbles import make_marble, marble_object
 from iga_drake.tasks.placement import TRIES, WorkArea
 from iga_drake.tasks.predicates import (
@@ -226,11 +225,13 @@ class Sweep(Task):
                     name, shapes[name], _MARBLE_COLOR, RigidTransform(X_WT.multiply(p_TM))
                 )
             )
-        return Scene(
-            objects=tuple(objects),
-            panda_position=self.observe_posture.copy(),
-            hand_opening=opening + 0.0002,
-            truth=replace(truth, X_EO={HELD: X_EO}),
+        return holding_scene(
+            objects,
+            self.observe_posture,
+            held=HELD,
+            X_EO=X_EO,
+            opening=opening,
+            truth=truth,
         )
 
     def expert(
