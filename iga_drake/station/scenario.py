@@ -229,14 +229,14 @@ def scenario_path(name: str | Path) -> Path:
     try:
         path.is_file()
     except (OSError, ValueError) as e:  # too long, a null character
-        raise ScenarioError(f"scenario {_cut(str(name))}: no path ({error_text(e)})") from e
+        raise ScenarioError(f"scenario {_cut_path(name)}: no path ({error_text(e)})") from e
     named = diagrams_dir() / f"{path.name.removesuffix('.yaml')}.yaml"
     if not path.is_file() and path.name == str(name) and named.is_file():
         return named
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in diagrams_dir().glob("*.yaml")))
         raise ScenarioError(
-            f"scenario {_cut(str(name))}: no such file; name a YAML file or one of: {known}"
+            f"scenario {_cut_path(name)}: no such file; name a YAML file or one of: {known}"
         )
     return path
 
@@ -394,6 +394,12 @@ def _cut(key: object) -> str:
     """A key that may be anything, in few characters."""
     text = key if isinstance(key, str) else shortened(key)
     return text if len(text) <= 80 else f"{text[:60]}..."
+
+
+def _cut_path(name: object) -> str:
+    """A path that may be anything: of a very long one, its beginning and its end."""
+    text = str(name)
+    return text if len(text) <= 300 else f"{text[:100]}...{text[-100:]}"
 
 
 # Drake itself looks at these values only when the plant is built.
