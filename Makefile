@@ -11,7 +11,7 @@ TORCH_BUILD ?= cpu
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 # What the demo needs, and what the tests need besides: extras of pyproject.toml, Debian's packages.
 DEMO_EXTRAS := visuals
-TEST_EXTRAS := $(DEMO_EXTRAS),icp,notebook,meshes,cluster,train,dif-net,geometric,dev
+TEST_EXTRAS := $(DEMO_EXTRAS),icp,notebook,meshes,cluster,train,dif-net,geometric,dev,docs
 # Some releases add t64 to a package's name.
 DEMO_PACKAGES := libglib2.0-0 libgl1 libegl1 libgl1-mesa-dri libgomp1 python3-venv
 TEST_PACKAGES := $(DEMO_PACKAGES) libusb-1.0-0
@@ -45,8 +45,15 @@ check: develop
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: check
+docs: develop
+	$(BIN)/python -m mkdocs build --quiet --strict --config-file .ci/mkdocs.yml --site-dir $(CURDIR)/outputs/site
+	@echo "outputs/site/index.html"
+
+test: check docs
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --nbmake tests notebooks
+
+check-debian13:
+	.ci/check-debian13
 
 clean:
 	rm -rf $(VENV) outputs

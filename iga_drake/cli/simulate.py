@@ -55,6 +55,9 @@ def run(arguments: argparse.Namespace) -> int:
     seed, split = arguments.seed, arguments.split
     with Episode(scenario, seed=seed, split=split, meshcat=meshcat) as episode:
         print(f"{episode.task.name}, seed {seed}, aligner {name}, {split} objects", flush=True)
+        if arguments.demonstrations and episode.demonstrations is not None:
+            used = len(episode.demonstrations)
+            print(f"    the first {used} demonstrations of {arguments.demonstrations}", flush=True)
         result = episode.run(on_event=lambda line: print(line, flush=True))
     if meshcat is not None:
         from iga_drake.viewing.replay import show_prediction, write_html
