@@ -1,5 +1,5 @@
-"""What the site has besides the pages of `docs/`: README as its first page, the changelog, a page of
-reference for each package, and the files of the repository that pages link to."""
+"""What the site has besides the pages of `docs/`: README as its first page, the changelog, a page
+of reference for each package, and the files of the repository that pages link to."""
 
 import re
 from pathlib import Path
