@@ -3,10 +3,10 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from iga_drake.aligners.registry import EXPERT
 from iga_drake.cli.options import add_aligner_options, aligner_options, names, seed
@@ -90,7 +90,8 @@ def run(arguments: argparse.Namespace) -> int:
     before = read_trials(arguments.compare) if arguments.compare else None
     store = ResultsStore(arguments.results) if arguments.results else None
     trials = _trials(arguments)
-    one, width = run_trial, 1
+    one: Callable[[Trial], TrialResult] = run_trial
+    width = 1
     if arguments.ray is not None:
         one, width = on_cluster(arguments.ray or None)
     shown = counter("trials", len(trials))
@@ -115,7 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
     summary = summarise_trials(results)
     comparison = None if before is None else compare_trials(before, results)
     if arguments.json:
-        document = {"summary": summary, "trials": [asdict(r) for r in results]}
+        document: dict[str, Any] = {"summary": summary, "trials": [asdict(r) for r in results]}
         if comparison is not None:
             document["comparison"] = asdict(comparison) | {"probability": comparison.probability}
         print(json.dumps(document, indent=2))
