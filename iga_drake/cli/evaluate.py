@@ -20,6 +20,7 @@ SUBCOMMANDS = {
     ),
     "familiarity": Subcommand("iga_drake.studies.familiarity"),
     "scaling": Subcommand("iga_drake.studies.scaling", "add_evaluate_scaling", "evaluate_scaling"),
+    "segmentation": Subcommand("iga_drake.studies.segmentation"),
     "stabilisers": Subcommand(
         "iga_drake.studies.stabilisers", "add_stabilisers", "evaluate_stabilisers"
     ),
