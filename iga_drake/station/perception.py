@@ -22,7 +22,7 @@ def add_fusion(
     """Adds the system "fusion", connected to all cameras of `station`, as the scenario sets it.
 
     Where it asks for geometric segmentation, the labels are those of a system "segmentation" that
-    is added too, and not the station's; it knows the target's size from the `demonstrations`.
+    is added too, and not the station's; it knows the target's shape from the `demonstrations`.
     """
     cameras = {name: camera_info(camera.intrinsics) for name, camera in scenario.cameras.items()}
     fusion = builder.AddNamedSystem("fusion", PointCloudFusion(cameras, scenario.fusion))

@@ -3,8 +3,9 @@
 The images are rendered from the default scenario's cameras, with noise. "whole images": every pixel
 inside the crop box belongs to the target. "objects": only the pixels of the objects do, as when the
 robot works. The other libraries get the whole images: unproject, crop, join, voxel filter; ours
-also counts pixels, drops those near jumps in depth, and removes specks. "geometric labels": the time
-in which the geometric segmenter makes the three label images; its points are the pixels labelled.
+also counts pixels, drops those near jumps in depth, and removes specks. "geometric labels":
+the time in which the geometric segmenter makes the three label images; its points are the pixels
+labelled.
 """
 
 import argparse

@@ -45,8 +45,11 @@ _SPECK = 4  # connected groups of fewer voxels are noise
 # Heights at the table are averaged over this many cells of this width (m), each way: the noise of
 # three cameras that are 1 m away is then below 0.5 mm.
 _CELL, _CELLS = 0.005, 5
-_SAMPLES = 400  # points of a cloud that its size is told from
+_SAMPLES = 400  # points of a cloud that its shape is told from
 _QUANTILES = np.linspace(0.025, 0.975, 20)
+_DIRECTIONS = np.linspace(0.0, np.pi / 2, 5)
+_SCALES = np.exp(np.linspace(-0.5, 0.5, 21))  # at which an object is compared with examples
+_SCALE_COUNTS = 0.05  # difference for a scale of e
 
 
 @dataclass
@@ -77,10 +80,11 @@ class SegmentationConfig:
     # Corners of the rectangle in x and y of W (m) in which the target's middle is expected.
     region_lower: list[float] = field(default_factory=lambda: [0.2, -0.5])
     region_upper: list[float] = field(default_factory=lambda: [0.85, 0.5])
-    # Greatest difference in size and height between the target and the demonstrations' targets, as
-    # a share of theirs; and how many times as different the next likely object has to be.
-    largest_difference: float = 0.6
-    distinctness: float = 1.2
+    # Greatest difference in shape (`ShapeLikeness`) between the target and the demonstrations'
+    # targets, as a share of their size; and how many times as different the next likely object has
+    # to be. Without demonstrations: how many times as large the largest object has to be.
+    largest_difference: float = 0.3
+    distinctness: float = 2.0
 
     def check(self, where: str = "segmentation") -> None:
         """Raises `ConfigError` for a value out of range."""
@@ -177,33 +181,48 @@ class _Above:
     low_heights: np.ndarray
 
 
-class SizeLikeness:
-    """Compares clouds of standing objects by size: the distribution of distances between any two of
-    their points (the shape distribution D2 of Osada et al., Shape Distributions, 2002) and of their
-    points' heights, both as quantiles."""
+class ShapeLikeness:
+    """Compares clouds of standing objects, however they are turned about the vertical.
+
+    A cloud is described by the joint distribution of the horizontal and the vertical distances
+    between any two of its points (after the shape distribution D2 of Osada et al., Shape
+    Distributions, 2002), as quantiles of its projections on several directions (sliced Wasserstein
+    distance, Bonneel et al. 2015), and by that of the points' heights. Products of one kind differ
+    most in size: clouds are compared at the best of several scales, which counts a little.
+    """
 
     def __init__(self, examples: Sequence[np.ndarray], table_height: float = 0.0) -> None:
         """`examples`: clouds (P, 3) (m, in W) of objects that stand on a table."""
         self._table_height = table_height
-        self._examples = [self._size(points) for points in examples if len(points) > 1]
+        self._examples = [self._describe(points) for points in examples if len(points) > 1]
 
     def __bool__(self) -> bool:
         return bool(self._examples)
 
-    def _size(self, points: np.ndarray) -> np.ndarray:
-        """Quantiles of distances and heights (m): (2, 20)."""
+    def _describe(self, points: np.ndarray) -> np.ndarray:
+        """Quantiles (m) of the distances' projections and of the heights: (6, 20)."""
         grid = voxelize(points, 0.005).centroids.astype(float)
         some = grid[np.linspace(0, len(grid) - 1, min(len(grid), _SAMPLES)).astype(int)]
-        distances = pdist(some) if len(some) > 1 else np.zeros(1)
+        if len(some) < 2:
+            return np.zeros((len(_DIRECTIONS) + 1, len(_QUANTILES)))
+        across, along = pdist(some[:, :2]), pdist(some[:, 2:])
         heights = some[:, 2] - self._table_height
-        return np.stack([np.quantile(distances, _QUANTILES), np.quantile(heights, _QUANTILES)])
+        rows = [np.cos(angle) * across + np.sin(angle) * along for angle in _DIRECTIONS]
+        return np.stack([np.quantile(row, _QUANTILES) for row in (*rows, heights)])
 
     def difference(self, points: np.ndarray) -> float:
-        """How different a cloud (P, 3) is from the likest example, as a share of its size; 0 where
-        there are none."""
-        size = self._size(points)
-        each = [np.abs(size - e).mean(axis=1) / e.mean(axis=1) for e in self._examples]
-        return float(min((shares.mean() for shares in each), default=0.0))
+        """How different a cloud (P, 3) is from the likest example, as a share of that one's size; 0
+        where there are none."""
+        own = self._describe(points)
+        return min(
+            (
+                float(np.abs(scale * own - example).mean() / np.abs(example).mean())
+                + _SCALE_COUNTS * abs(float(np.log(scale)))
+                for example in self._examples
+                for scale in _SCALES
+            ),
+            default=0.0,
+        )
 
 
 class GeometricSegmenter:
@@ -214,8 +233,8 @@ class GeometricSegmenter:
     3. The rest, fused in voxels, falls into clusters that keep a gap from each other.
     4. A cluster between the pads that stands on nothing is held: it can only move with the hand.
     5. The target stands on the table, in the region where it is expected. If there are several, it
-       is the one likest in size to the demonstrations' targets, without these the largest; where
-       two are much alike, none is.
+       is the one likest in shape to the demonstrations' targets (`ShapeLikeness`), without these
+       the largest; where two could be it, none is.
     """
 
     def __init__(
@@ -238,7 +257,7 @@ class GeometricSegmenter:
         self._config = config or SegmentationConfig()
         self._fusion = fusion or FusionConfig()
         self._config.check("SegmentationConfig")
-        self._likeness = SizeLikeness(examples, self._config.table_height)
+        self._likeness = ShapeLikeness(examples, self._config.table_height)
         self._corner = np.array(self._fusion.crop_lower[:2])
         extent = np.array(self._fusion.crop_upper[:2]) - self._corner
         self._shape = tuple(int(n) for n in np.ceil(extent / _CELL).astype(int) + 1)
@@ -475,7 +494,7 @@ class GeometricSegmenter:
         first = objects[0]
         if first.difference > config.largest_difference:
             return (
-                f"none of {len(objects)} objects on the table has the size of the demonstrations' "
+                f"none of {len(objects)} objects on the table looks like the demonstrations' "
                 f"target: the likest differs by {100 * first.difference:.0f} %, at most "
                 f"{100 * config.largest_difference:.0f} % are allowed "
                 "(segmentation.largest_difference)"
@@ -486,7 +505,7 @@ class GeometricSegmenter:
                 alike = second.difference < config.distinctness * first.difference
                 measure = (
                     f"differ by {100 * first.difference:.0f} % and "
-                    f"{100 * second.difference:.0f} % from the demonstrations' target in size"
+                    f"{100 * second.difference:.0f} % from the demonstrations' target in shape"
                 )
             else:
                 alike = first.voxels < config.distinctness * second.voxels
@@ -504,7 +523,7 @@ class GeometricSegmenter:
 class _Candidate(NamedTuple):
     """An object that stands on the table."""
 
-    difference: float  # from the demonstrations' targets, as a share of their size
+    difference: float  # from the demonstrations' targets (`ShapeLikeness`)
     voxels: int
     group: int
     middle: np.ndarray  # (2,) of its outline in W (m)

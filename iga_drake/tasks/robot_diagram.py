@@ -87,7 +87,7 @@ def build_robot_diagram(
       station: exports the port contract for the scenario's cameras.
       motion: what the task observes and how it moves around its waypoints.
       inference: finds the waypoints.
-      demonstrations: give the hand's openings, and the geometric segmenter the target's size;
+      demonstrations: give the hand's openings, and the geometric segmenter the target's shape;
         None takes the openings from `motion`.
       seed: of the aligner, with `scenario.seeds.aligner` added.
 

@@ -18,7 +18,7 @@ from iga_drake.systems.geometric_segmentation import (
     GeometricSegmentation,
     GeometricSegmenter,
     SegmentationConfig,
-    SizeLikeness,
+    ShapeLikeness,
     fit_table,
 )
 from iga_drake.systems.ports import Role
@@ -201,8 +201,8 @@ def test_two_equal_objects_are_refused_with_their_places(gantry):
     assert (label == TARGET).sum() < 0.7 * (truth == TARGET).sum()
 
 
-def test_the_largest_object_is_the_target_unless_demonstrations_tell_its_size(gantry):
-    large = ((0.45, -0.2, 0.06), (0.14, 0.12, 0.12))
+def test_the_largest_object_is_the_target_unless_demonstrations_tell_its_shape(gantry):
+    large = ((0.45, -0.2, 0.03), (0.24, 0.18, 0.06))
     far = AT + [0.0, 0.3, 0.2]
     small_first = [(TARGET, *CUP), (BACKGROUND, *large), *hand_boxes(far)]
     large_first = [(BACKGROUND, *CUP), (TARGET, *large), *hand_boxes(far)]
@@ -218,10 +218,10 @@ def test_the_largest_object_is_the_target_unless_demonstrations_tell_its_size(ga
         assert recall > 0.85
 
 
-def test_nothing_of_the_demonstrated_size_is_refused(gantry):
-    example = surface((0.4, 0.0, 0.1), (0.3, 0.3, 0.2))
+def test_nothing_of_the_demonstrated_shape_is_refused(gantry):
+    example = surface((0.4, 0.0, 0.02), (0.3, 0.06, 0.04))
     found, _, label = segment(gantry, [(TARGET, *CUP)], examples=[example])
-    assert "size of the demonstrations' target" in found.problems["target"]
+    assert "looks like the demonstrations' target" in found.problems["target"]
     assert not (label == TARGET).any()
 
 
@@ -307,13 +307,19 @@ def test_the_table_is_fitted_beside_what_stands_on_it(x_slope, y_slope, height):
     assert abs(plane.height + 0.5 * plane.x_slope - height) < 1e-3
 
 
-def test_size_likeness_ignores_place_and_turn():
+def test_likeness_ignores_place_and_turn_and_knows_shapes():
     box = surface((0.5, 0.1, 0.05), (0.10, 0.08, 0.10))
-    likeness = SizeLikeness([box])
+    likeness = ShapeLikeness([box])
     c, s = np.cos(0.7), np.sin(0.7)
     turned = box @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T + [0.1, -0.4, 0.0]
-    assert likeness.difference(turned) < 0.05
-    assert likeness.difference(1.5 * box) == pytest.approx(0.5, abs=0.05)
+    larger = 1.4 * box
+    slab = surface((0.5, 0.1, 0.02), (0.20, 0.10, 0.04))
+    pole = surface((0.5, 0.1, 0.12), (0.03, 0.03, 0.24))
+    differences = [likeness.difference(points) for points in (turned, larger, slab, pole)]
+    assert max(differences[:2]) < 0.06
+    assert min(differences[2:]) > 0.15
+    assert likeness.difference(box) < 1e-9
+    assert ShapeLikeness([]).difference(box) == 0.0
 
 
 def _fix(system, context, name, boxes, X_WC) -> None:
