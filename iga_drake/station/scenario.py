@@ -29,6 +29,7 @@ from iga_drake.station.cameras.kinds import camera_type
 from iga_drake.station.cameras.rgbd import LookAt, RgbdCamera
 from iga_drake.systems.differential_ik import DifferentialIkConfig
 from iga_drake.systems.fusion import FusionConfig
+from iga_drake.systems.geometric_segmentation import SegmentationConfig
 from iga_drake.systems.ports import PANDA_JOINTS
 from iga_drake.systems.supervisor import SupervisorConfig
 from iga_drake.systems.waypoint_follower import WaypointFollowerConfig
@@ -146,9 +147,14 @@ class Scenario:
     # Name -> camera of any kind, at least one. A file that has this section states all cameras it
     # wants; what is no plain RGB-D camera has a tag, the name of its kind's class.
     cameras: dict[str, RgbdCamera] = field(default_factory=_cameras)
+    # Number of further objects on the table, of families that the task isn't about, out of the way
+    # and background to the cameras (`iga_drake.tasks.distractors`).
+    distractors: int = 0
     # Errors of the simulated cameras at the objects: masks that leak, stray depth.
     clutter: Clutter = field(default_factory=Clutter)
     fusion: FusionConfig = field(default_factory=FusionConfig)
+    # Whose labels tell the objects apart: the station's, or those of the geometric segmenter.
+    segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
     planning: PlanningConfig = field(default_factory=PlanningConfig)
     control: WaypointFollowerConfig = field(default_factory=WaypointFollowerConfig)
     differential_ik: DifferentialIkConfig = field(default_factory=DifferentialIkConfig)
@@ -451,8 +457,10 @@ def _check_values(s: Scenario) -> None:
         check_range(good, "cameras", name, "names of 1 to 64 printable characters")
     for name, camera in s.cameras.items():
         camera.check(f"cameras.{name}")
+    check_range(0 <= s.distractors <= 20, "distractors", s.distractors, "0 to 20")
     s.clutter.check("clutter")
     s.fusion.check("fusion")
+    s.segmentation.check("segmentation")
     s.planning.check("planning")
     s.control.check("control")
     s.differential_ik.check(s.control.period, "differential_ik")

@@ -38,6 +38,7 @@ from iga_drake.station.make import make_station
 from iga_drake.station.panda.model import find_panda
 from iga_drake.station.scenario import Scenario
 from iga_drake.systems.messages import Cause
+from iga_drake.tasks.distractors import with_distractors
 from iga_drake.tasks.pose_error import pose_error_at
 from iga_drake.tasks.registry import make_task
 from iga_drake.tasks.robot_diagram import RobotDiagram, build_robot_diagram
@@ -265,7 +266,11 @@ class Episode:
             read = read_demonstrations(folder, task=self.task.name)
             demonstrations = read.first(min(scenario.context_size, len(read)))
         self.demonstrations = None if chosen == EXPERT else demonstrations
-        self.scene = self.task.scene(seed + scenario.seeds.scene, split)
+        self.scene = with_distractors(
+            self.task.scene(seed + scenario.seeds.scene, split),
+            scenario.distractors,
+            seed + scenario.seeds.scene,
+        )
         # Other draws of calibration and noise than any demonstration's with the same seed.
         draws = seed + (TEST_SEED_OFFSET if split == "test" else 0)
         self.inference = self._make_inference(chosen)

@@ -87,14 +87,15 @@ def build_robot_diagram(
       station: exports the port contract for the scenario's cameras.
       motion: what the task observes and how it moves around its waypoints.
       inference: finds the waypoints.
-      demonstrations: give the hand's openings; None takes them from `motion`.
+      demonstrations: give the hand's openings, and the geometric segmenter the target's shape;
+        None takes the openings from `motion`.
       seed: of the aligner, with `scenario.seeds.aligner` added.
 
     Where the arm starts is not asked: everything begins with the joints as first measured.
     """
     builder = DiagramBuilder()
     builder.AddNamedSystem("station", station)
-    fusion = add_fusion(builder, station, scenario)
+    fusion = add_fusion(builder, station, scenario, demonstrations)
     robot = make_panda_planning_robot(scenario.table, scenario.planning)
     solver = PoseSolver(robot, config=scenario.planning)
     period = scenario.control.period
