@@ -84,10 +84,11 @@ class WaypointResult:
 
     def row(self) -> dict[str, Any]:
         """The result as plain JSON values."""
+        known = self.estimate.familiarity
         return {
             "name": self.name,
             "energy": self.energy,
-            "familiarity": self.estimate.familiarity,
+            "familiarity": None if known is None else known.tolist(),
             "position_error": self.position_error,
             "rotation_error": self.rotation_error,
             "inference_seconds": self.inference_seconds,
