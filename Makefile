@@ -16,7 +16,7 @@ TEST_EXTRAS := $(DEMO_EXTRAS),icp,notebook,meshes,cluster,train,dif-net,geometri
 DEMO_PACKAGES := libglib2.0-0 libgl1 libegl1 libgl1-mesa-dri libgomp1 python3-venv
 TEST_PACKAGES := $(DEMO_PACKAGES) libusb-1.0-0
 
-.PHONY: help setup demo develop check test docs check-debian13 clean
+.PHONY: help setup demo develop check test docs fuzz check-debian13 clean
 .DEFAULT_GOAL := help
 
 help:
@@ -24,6 +24,7 @@ help:
 	@echo "make setup           sets up what the demo needs, and no more"
 	@echo "make test            sets up all extras, checks style and types, runs all tests"
 	@echo "make check           style and types alone"
+	@echo "make fuzz            runs the property tests on $(FUZZ_INPUTS) inputs each"
 	@echo "make docs            builds the documentation as a site"
 	@echo "make check-debian13  runs 'make demo' and 'make test' in a bare Debian 13 (as root)"
 	@echo "make clean           removes $(VENV) and outputs"
@@ -51,6 +52,12 @@ docs: develop
 
 test: check docs
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --nbmake tests notebooks
+
+# Many more inputs for the property tests; FUZZ_INPUTS of each, which follow from FUZZ_SEED.
+FUZZ_INPUTS ?= 2000
+FUZZ_SEED ?= 0
+fuzz: develop
+	OMP_NUM_THREADS=1 FUZZ_INPUTS=$(FUZZ_INPUTS) $(BIN)/pytest -n auto -m hypothesis --hypothesis-seed=$(FUZZ_SEED) --hypothesis-show-statistics tests
 
 check-debian13:
 	.ci/check-debian13

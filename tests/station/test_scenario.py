@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.multibody.plant import MultibodyPlantConfig
 
@@ -233,7 +233,6 @@ def test_every_number_has_an_upper_bound_and_is_named(key: str):
 
 
 @given(st.sampled_from(NUMBERS), st.sampled_from(WILD) | st.floats() | st.integers())
-@settings(max_examples=60)
 def test_any_value_is_accepted_within_its_bounds_or_refused_by_name(key: str, value):
     text = str(value).lower() if value is None or isinstance(value, float) else f"{value}"
     try:
@@ -255,7 +254,6 @@ NODES = st.recursive(
 
 
 @given(NODES)
-@settings(max_examples=60)
 def test_any_file_is_read_or_refused(node):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scenario.yaml"
