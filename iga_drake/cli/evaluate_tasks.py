@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from iga_drake.aligners.registry import EXPERT
+from iga_drake.aligners.registry import PRIVILEGED
 from iga_drake.cli.options import add_aligner_options, aligner_options, names, seed
 from iga_drake.cli.scenarios import add_overlay_arguments, scenario_of, with_aligner
 from iga_drake.cli.status import FAILURE, INTERNAL, SUCCESS, CommandError
@@ -22,7 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tasks", type=names, default=["grasp", "stack"], help="scenarios")
     add_overlay_arguments(parser)
     parser.add_argument("--trials", type=int, default=15)
-    parser.add_argument("--aligner", type=names, default=["iga", "icp"], help="names, or expert")
+    parser.add_argument(
+        "--aligner", type=names, default=["iga", "icp"], help="names, expert or oracle"
+    )
     add_aligner_options(parser)
     parser.add_argument("--seed", type=seed, default=0, help="seed of the first trial")
     parser.add_argument("--split", choices=("test", "demonstration"), default="test")
@@ -32,13 +34,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--at-least", type=float, metavar="RATE",
         help="end with 1 where a scenario succeeds less often with one of the aligners, in [0, 1]",
     )  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="print the summary as JSON")
+    form.add_argument("--markdown", action="store_true", help="print the tables as Markdown")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Runs the trials, tells each verdict, prints the table."""
     from iga_drake.evaluation.results import ResultsStore
-    from iga_drake.evaluation.task_success import BROKEN, evaluate, format_table, summarise_trials
+    from iga_drake.evaluation.task_success import (
+        BROKEN,
+        evaluate,
+        format_markdown,
+        format_table,
+        summarise_trials,
+    )
 
     if arguments.trials < 1:
         raise CommandError(f"--trials {arguments.trials}: at least 1 is needed")
@@ -60,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
         document = {"summary": summary, "trials": [asdict(r) for r in results]}
         print(json.dumps(document, indent=2))
     else:
-        print(format_table(results))
+        print(format_markdown(results) if arguments.markdown else format_table(results))
     if any(result.cause == BROKEN for result in results):
         return INTERNAL
     if arguments.at_least is not None and any(r["rate"] < arguments.at_least for r in summary):
@@ -76,7 +86,8 @@ def _trials(arguments: argparse.Namespace) -> "list[Trial]":
     from iga_drake.evaluation.task_success import Trial, trial_key
     from iga_drake.station.scenario import scenario_path
 
-    given = aligner_options(arguments, [name for name in arguments.aligner if name != EXPERT])
+    own = [name for name in arguments.aligner if name not in PRIVILEGED]
+    given = aligner_options(arguments, own)
     paths = [scenario_path(name) for name in arguments.tasks]
     changes = [f"--with={overlay}" for overlay in arguments.overlays]
     changes += [f"--set={override}" for override in arguments.overrides]

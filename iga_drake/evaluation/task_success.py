@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from pathlib import Path
 from statistics import NormalDist
 from typing import Any
 
-from iga_drake.aligners.registry import EXPERT, make_aligner
+from iga_drake.aligners.registry import PRIVILEGED, make_aligner
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, folder_digest
 from iga_drake.files import process_lives
@@ -68,6 +69,7 @@ class TrialResult:
     rotation_error: float | None = None
     inference_seconds: float | None = None
     real_time_factor: float | None = None
+    simulated_seconds: float | None = None
     wall_seconds: float | None = None
     reused: bool = False  # measured before, and found in a results file
 
@@ -79,7 +81,7 @@ def trial_key(scenario: Scenario) -> dict[str, Any]:
     Loads the aligner to learn its weights' digest. Raises `AlignerError` if that fails.
     """
     name, options = scenario.aligner.name, scenario.aligner.options
-    aligner = None if name == EXPERT else make_aligner(name, **options)
+    aligner = None if name in PRIVILEGED else make_aligner(name, **options)
     return {
         "kind": "tasks",
         "scenario": scenario.digest,
@@ -165,7 +167,7 @@ def _remove_left() -> None:
 
 _MEASURED = (
     "task", "success", "cause", "reason", "position_error", "rotation_error", "inference_seconds",
-    "real_time_factor", "wall_seconds",
+    "real_time_factor", "simulated_seconds", "wall_seconds",
 )  # fmt: skip
 
 
@@ -222,6 +224,11 @@ def _median(values: Iterable[float | None]) -> float | None:
     return present[len(present) // 2] if present else None
 
 
+def _mean(values: Iterable[float | None]) -> float | None:
+    present = [value for value in values if value is not None]
+    return math.fsum(present) / len(present) if present else None
+
+
 def summarise_trials(results: Sequence[TrialResult]) -> list[dict[str, Any]]:
     """One row for each scenario and aligner, in the order of their first result."""
     rows = []
@@ -242,6 +249,9 @@ def summarise_trials(results: Sequence[TrialResult]) -> list[dict[str, Any]]:
                 "median_rotation_error_rad": _median(r.rotation_error for r in mine),
                 "median_inference_s": _median(r.inference_seconds for r in mine),
                 "median_real_time_factor": _median(r.real_time_factor for r in mine),
+                "mean_simulated_s": _mean(r.simulated_seconds for r in mine),
+                "mean_wall_s": _mean(r.wall_seconds for r in mine),
+                "causes": dict(sorted(Counter(r.cause for r in mine if not r.success).items())),
                 "reused": sum(r.reused for r in mine),
                 "failures": [
                     {"seed": r.seed, "cause": r.cause, "reason": r.reason}
@@ -287,3 +297,65 @@ def format_table(results: Sequence[TrialResult]) -> str:
     if failures:
         lines += ["", "failures:", *failures]
     return "\n".join(lines)
+
+
+def format_markdown(results: Sequence[TrialResult]) -> str:
+    """The summary as Markdown: scenarios by aligners, then one line for each of both with causes
+    and times, then the failures."""
+    rows = summarise_trials(results)
+    found = {(row["scenario"], row["aligner"]): row for row in rows}
+    scenarios = list(dict.fromkeys(row["scenario"] for row in rows))
+    aligners = list(dict.fromkeys(row["aligner"] for row in rows))
+
+    def rate(scenario: str, aligner: str) -> str:
+        row = found.get((scenario, aligner))
+        return "" if row is None else f"{row['successes']} / {row['trials']} ({_wilson(row)})"
+
+    def number(value: float | None, scale: float, unit: str, digits: int) -> str:
+        return "" if value is None else f"{scale * value:.{digits}f}{unit}"
+
+    matrix = [[scenario, *(rate(scenario, name) for name in aligners)] for scenario in scenarios]
+    details = [
+        [
+            row["scenario"],
+            row["aligner"],
+            f"{row['successes']} / {row['trials']}",
+            _wilson(row),
+            ", ".join(f"{cause} {count}" for cause, count in row["causes"].items()),
+            number(row["median_position_error_m"], 100, " cm", 2),
+            number(row["median_rotation_error_rad"], 180 / math.pi, "\N{DEGREE SIGN}", 1),
+            number(row["median_inference_s"], 1, " s", 1),
+            number(row["mean_simulated_s"], 1, " s", 1),
+            number(row["mean_wall_s"], 1, " s", 0),
+            number(row["median_real_time_factor"], 1, "", 2),
+        ]
+        for row in rows
+    ]
+    parts = [
+        _markdown_table(["scenario", *aligners], matrix),
+        _markdown_table(
+            [
+                "scenario", "aligner", "success", "95 % (Wilson)", "causes of failure", "position",
+                "rotation", "inference", "simulated, mean", "wall clock, mean", "real-time factor",
+            ],
+            details,
+        ),
+    ]  # fmt: skip
+    failures = [
+        f"- {row['scenario']}, {row['aligner']}, seed {f['seed']}: {f['cause']}: {f['reason']}"
+        for row in rows
+        for f in row["failures"]
+    ]
+    return "\n\n".join(parts + (["\n".join(failures)] if failures else []))
+
+
+def _wilson(row: Mapping[str, Any]) -> str:
+    low, high = row["wilson_95"]
+    return f"{100 * low:.0f} - {100 * high:.0f} %"
+
+
+def _markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+    )

@@ -12,6 +12,7 @@ from iga_drake.evaluation.task_success import (
     Trial,
     TrialResult,
     evaluate,
+    format_markdown,
     format_table,
     run_trial,
     summarise_trials,
@@ -142,6 +143,22 @@ def test_summary_counts_and_names_causes():
     table = format_table(results)
     assert "4 / 6" in table
     assert "grasp icp seed 1: contact: slipped" in table
+
+
+def test_markdown_has_scenarios_by_aligners_and_the_causes():
+    trials = make_trials(range(6)) + make_trials(range(2, 5), aligner="expert")
+    trials += make_trials(range(1), scenario="a|b")
+    text = format_markdown(evaluate(trials, run=FakeRun()))
+    matrix, details, failures = text.split("\n\n")
+    rows = [[cell.strip() for cell in line.split(" | ")] for line in matrix.splitlines()]
+    assert rows[0] == ["| scenario", "icp", "expert |"]
+    assert rows[2] == ["| grasp", "4 / 6 (30 - 90 %)", "3 / 3 (44 - 100 %) |"]
+    assert rows[3][0] == "| a\\|b" and rows[3][2] == "|"
+    low, high = binomtest(4, 6).proportion_ci(method="wilson")
+    assert (round(100 * low), round(100 * high)) == (30, 90)
+    assert "| grasp | icp | 4 / 6 | 30 - 90 % | contact 2 |" in details
+    assert failures.splitlines()[0] == "- grasp, icp, seed 0: contact: slipped"
+    assert len(failures.splitlines()) == 3
 
 
 def test_a_process_that_breaks_is_a_failed_trial(tmp_path: Path):
