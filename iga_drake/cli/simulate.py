@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         def tell(line: str) -> None:
             print(line, flush=True)
-            if strip is not None:
+            if strip is not None and " s  infer " not in line:  # nothing has moved since
                 strip.add(line.partition("\n")[0].partition("  (")[0].strip()[:60])
 
         result = episode.run(on_event=tell)
