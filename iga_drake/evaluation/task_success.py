@@ -17,7 +17,8 @@ from statistics import NormalDist
 from typing import Any
 
 from iga_drake.aligners.registry import PRIVILEGED, make_aligner
-from iga_drake.errors import IgaDrakeError
+from iga_drake.cluster import connect_cluster
+from iga_drake.errors import IgaDrakeError, error_text
 from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, folder_digest
 from iga_drake.files import process_lives
 from iga_drake.station.scenario import Scenario
@@ -147,8 +148,30 @@ def run_trial(trial: Trial, *, timeout: float = 1800.0) -> TrialResult:
             _let_go(held)
         if path.is_file():
             return _result(trial, json.loads(path.read_text(encoding="utf-8")))
-    broken = {"task": trial.task, "success": False, "cause": BROKEN, "reason": reason}
-    return _result(trial, broken)
+    return _broken(trial, reason)
+
+
+def on_cluster(address: str | None) -> tuple[Callable[[Trial], TrialResult], int]:
+    """`run_trial` on a Ray cluster (None: the local one), and how many it can run at a time.
+
+    Its machines need this package, and the scenario, demonstrations and folders of replays at the
+    same paths. A trial whose machine is lost is run again on another. Raises `ClusterError`.
+    """
+    ray = connect_cluster(address)
+    remote = ray.remote(num_cpus=1, max_retries=2)(run_trial)
+
+    def run(trial: Trial) -> TrialResult:
+        try:
+            return ray.get(remote.remote(trial))
+        except ray.exceptions.RayError as error:
+            return _broken(trial, error_text(error))
+
+    return run, max(1, int(ray.cluster_resources().get("CPU", 1)))
+
+
+def _broken(trial: Trial, reason: str) -> TrialResult:
+    row = {"task": trial.task, "success": False, "cause": BROKEN, "reason": reason}
+    return _result(trial, row)
 
 
 def _let_go(held: int) -> None:
@@ -205,7 +228,8 @@ def evaluate(
             if ended.is_set():
                 return result  # of a process that was ended
             if store and result.cause != BROKEN:
-                store.add(trial.whole_key, {n: getattr(result, n) for n in _MEASURED})
+                row = {"scenario": trial.scenario}
+                store.add(trial.whole_key, row | {n: getattr(result, n) for n in _MEASURED})
         on_result(result)
         return result
 
@@ -297,65 +321,3 @@ def format_table(results: Sequence[TrialResult]) -> str:
     if failures:
         lines += ["", "failures:", *failures]
     return "\n".join(lines)
-
-
-def format_markdown(results: Sequence[TrialResult]) -> str:
-    """The summary as Markdown: scenarios by aligners, then one line for each of both with causes
-    and times, then the failures."""
-    rows = summarise_trials(results)
-    found = {(row["scenario"], row["aligner"]): row for row in rows}
-    scenarios = list(dict.fromkeys(row["scenario"] for row in rows))
-    aligners = list(dict.fromkeys(row["aligner"] for row in rows))
-
-    def rate(scenario: str, aligner: str) -> str:
-        row = found.get((scenario, aligner))
-        return "" if row is None else f"{row['successes']} / {row['trials']} ({_wilson(row)})"
-
-    def number(value: float | None, scale: float, unit: str, digits: int) -> str:
-        return "" if value is None else f"{scale * value:.{digits}f}{unit}"
-
-    matrix = [[scenario, *(rate(scenario, name) for name in aligners)] for scenario in scenarios]
-    details = [
-        [
-            row["scenario"],
-            row["aligner"],
-            f"{row['successes']} / {row['trials']}",
-            _wilson(row),
-            ", ".join(f"{cause} {count}" for cause, count in row["causes"].items()),
-            number(row["median_position_error_m"], 100, " cm", 2),
-            number(row["median_rotation_error_rad"], 180 / math.pi, "\N{DEGREE SIGN}", 1),
-            number(row["median_inference_s"], 1, " s", 1),
-            number(row["mean_simulated_s"], 1, " s", 1),
-            number(row["mean_wall_s"], 1, " s", 0),
-            number(row["median_real_time_factor"], 1, "", 2),
-        ]
-        for row in rows
-    ]
-    parts = [
-        _markdown_table(["scenario", *aligners], matrix),
-        _markdown_table(
-            [
-                "scenario", "aligner", "success", "95 % (Wilson)", "causes of failure", "position",
-                "rotation", "inference", "simulated, mean", "wall clock, mean", "real-time factor",
-            ],
-            details,
-        ),
-    ]  # fmt: skip
-    failures = [
-        f"- {row['scenario']}, {row['aligner']}, seed {f['seed']}: {f['cause']}: {f['reason']}"
-        for row in rows
-        for f in row["failures"]
-    ]
-    return "\n\n".join(parts + (["\n".join(failures)] if failures else []))
-
-
-def _wilson(row: Mapping[str, Any]) -> str:
-    low, high = row["wilson_95"]
-    return f"{100 * low:.0f} - {100 * high:.0f} %"
-
-
-def _markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(
-        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
-    )

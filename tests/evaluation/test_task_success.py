@@ -12,8 +12,8 @@ from iga_drake.evaluation.task_success import (
     Trial,
     TrialResult,
     evaluate,
-    format_markdown,
     format_table,
+    on_cluster,
     run_trial,
     summarise_trials,
     trial_key,
@@ -145,20 +145,23 @@ def test_summary_counts_and_names_causes():
     assert "grasp icp seed 1: contact: slipped" in table
 
 
-def test_markdown_has_scenarios_by_aligners_and_the_causes():
-    trials = make_trials(range(6)) + make_trials(range(2, 5), aligner="expert")
-    trials += make_trials(range(1), scenario="a|b")
-    text = format_markdown(evaluate(trials, run=FakeRun()))
-    matrix, details, failures = text.split("\n\n")
-    rows = [[cell.strip() for cell in line.split(" | ")] for line in matrix.splitlines()]
-    assert rows[0] == ["| scenario", "icp", "expert |"]
-    assert rows[2] == ["| grasp", "4 / 6 (30 - 90 %)", "3 / 3 (44 - 100 %) |"]
-    assert rows[3][0] == "| a\\|b" and rows[3][2] == "|"
-    low, high = binomtest(4, 6).proportion_ci(method="wilson")
-    assert (round(100 * low), round(100 * high)) == (30, 90)
-    assert "| grasp | icp | 4 / 6 | 30 - 90 % | contact 2 |" in details
-    assert failures.splitlines()[0] == "- grasp, icp, seed 0: contact: slipped"
-    assert len(failures.splitlines()) == 3
+def test_a_cluster_gives_the_same_rows(monkeypatch):
+    """An episode that ends for lack of time, on a cluster of one core and here."""
+    import ray
+
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    arguments = ("grasp", "--set=task.time_limit=0.1", "--set=plant.time_step=0.01")
+    trials = make_trials([3, 4], arguments=arguments, aligner="expert")
+    ray.init(num_cpus=1, include_dashboard=False, object_store_memory=80 * 2**20)
+    try:
+        run, width = on_cluster(None)
+        there = evaluate(trials, processes=width, run=run)
+    finally:
+        ray.shutdown()
+    assert width == 1 and [result.cause for result in there] == ["time", "time"]
+    here = evaluate(trials, processes=2)
+    measured = {"wall_seconds": None, "real_time_factor": None}
+    assert [replace(r, **measured) for r in there] == [replace(r, **measured) for r in here]
 
 
 def test_a_process_that_breaks_is_a_failed_trial(tmp_path: Path):
