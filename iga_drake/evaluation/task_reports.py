@@ -196,7 +196,7 @@ def markdown_summary(results: Sequence[TrialResult], comparison: Comparison | No
 
 
 def _rates(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Lines of a table: successes of trials, a line for each scenario, a column for each aligner."""
+    """Lines of a table: successes of trials, scenarios down and aligners across."""
     aligners = list(dict.fromkeys(row["aligner"] for row in rows))
     found = {(row["scenario"], row["aligner"]): row for row in rows}
     lines = [
