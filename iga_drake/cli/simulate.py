@@ -23,7 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=seed, default=0, help="scene, noise and aligner")
     parser.add_argument(
         "--aligner", metavar="NAME",
-        help="default: the scenario's; expert: poses of the scripted expert, which sees all",
+        help="default: the scenario's; expert: poses of the scripted expert, which sees all; "
+        "oracle: the expert's poses for the objects as the cameras show them",
     )  # fmt: skip
     add_aligner_options(parser)
     parser.add_argument(
@@ -31,14 +32,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--meshcat", action="store_true", help="show the scene in a browser")
     parser.add_argument("--html", type=Path, metavar="OUT", help="write a replay to look at")
+    parser.add_argument(
+        "--png", type=Path, metavar="OUT", help="write a picture of every phase (needs matplotlib)"
+    )
     parser.add_argument("--result", type=Path, metavar="JSON", help="write the result as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Runs the episode, tells how it goes, writes what was asked for."""
     from iga_drake.tasks.episode import Episode
+    from iga_drake.tasks.frames import FrameStrip
+    from iga_drake.viewing.figures import check_figure
 
     check_output(arguments.html)  # before minutes of simulation
+    check_output(arguments.png)
+    check_figure(arguments.png)
     check_output(arguments.result, begins=(b'{"task"',))
     scenario = scenario_of(arguments)
     name = arguments.aligner or scenario.aligner.name
@@ -58,7 +66,17 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.demonstrations and episode.demonstrations is not None:
             used = len(episode.demonstrations)
             print(f"    the first {used} demonstrations of {arguments.demonstrations}", flush=True)
-        result = episode.run(on_event=lambda line: print(line, flush=True))
+        strip = FrameStrip(episode) if arguments.png else None
+
+        def tell(line: str) -> None:
+            print(line, flush=True)
+            if strip is not None and " s  infer " not in line:  # nothing has moved since
+                strip.add(line.partition("\n")[0].partition("  (")[0].strip()[:60])
+
+        result = episode.run(on_event=tell)
+    if strip is not None:
+        strip.write(arguments.png)
+        print(f"pictures: {arguments.png}")
     if meshcat is not None:
         from iga_drake.viewing.replay import show_prediction, write_html
 

@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from iga_drake.aligners.protocol import Aligner, PoseEstimate
-from iga_drake.aligners.registry import EXPERT, check_aligner
+from iga_drake.aligners.registry import EXPERT, ORACLE, PRIVILEGED, check_aligner
 from iga_drake.demonstrations.demonstration import (
     Demonstration,
     DemonstrationSet,
@@ -39,6 +39,7 @@ from iga_drake.station.panda.model import find_panda
 from iga_drake.station.scenario import Scenario
 from iga_drake.systems.messages import Cause
 from iga_drake.tasks.distractors import with_distractors
+from iga_drake.tasks.oracle import OracleInference
 from iga_drake.tasks.pose_error import pose_error_at
 from iga_drake.tasks.registry import make_task
 from iga_drake.tasks.robot_diagram import RobotDiagram, build_robot_diagram
@@ -239,7 +240,7 @@ class Episode:
       scenario: how the diagram is wired.
       seed: decides scene, camera noise and the aligner's random choices.
       aligner: the name of an aligner, which runs in a worker process, or an aligner, which runs in
-        this one, or "expert"; default: the scenario's.
+        this one, or "expert" or "oracle"; default: the scenario's.
       split: whose objects: "test" (never demonstrated) or "demonstration".
       demonstrations: the aligner's context; default: the scenario's folder.
       meshcat: where to show it.
@@ -262,11 +263,11 @@ class Episode:
         self.scenario, self.seed, self.split = scenario, seed, split
         self.task: Task = make_task(scenario.task.name)
         chosen = scenario.aligner.name if aligner is None else aligner
-        if chosen != EXPERT and demonstrations is None:
+        if chosen not in PRIVILEGED and demonstrations is None:
             folder = demonstrations_path(scenario)
             read = read_demonstrations(folder, task=self.task.name)
             demonstrations = read.first(min(scenario.context_size, len(read)))
-        self.demonstrations = None if chosen == EXPERT else demonstrations
+        self.demonstrations = None if chosen in PRIVILEGED else demonstrations
         self.scene = with_distractors(
             self.task.scene(seed + scenario.seeds.scene, split),
             scenario.distractors,
@@ -301,6 +302,8 @@ class Episode:
     def _make_inference(self, aligner: str | Aligner) -> Inference:
         if aligner == EXPERT:
             return ExpertInference(lambda: self._expert(self.snapshot()))
+        if aligner == ORACLE:
+            return OracleInference(self.task, self.scene, self.snapshot)
         assert self.demonstrations is not None
         contexts = self.demonstrations.contexts
         if not isinstance(aligner, str):
