@@ -120,13 +120,12 @@ class Browser:
         assert "exceptionDetails" not in done, done["exceptionDetails"]
         return done["result"].get("value")
 
-    def wait_for(self, script: str, timeout: float = 60.0) -> Any:
-        """Waits until an expression has a value that counts as true, and returns it."""
+    def wait_for(self, script: str, timeout: float = 60.0) -> None:
+        """Waits until an expression has a value that counts as true."""
         end = time.monotonic() + timeout
-        while not (value := self.evaluate(script)):
+        while not self.evaluate(f"Boolean({script})"):
             assert time.monotonic() < end, f"not within {timeout} s: {script}; {self.errors}"
             time.sleep(0.05)
-        return value
 
     def picture(self, path: Path, **options: Any) -> None:
         """Writes what is seen as a picture; `options` of `Page.captureScreenshot`."""

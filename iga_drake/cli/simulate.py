@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from iga_drake.station.scenario import Scenario
     from iga_drake.viewing.meshcat import RunButtons
 
-_FRAME_RATE = 32.0  # of recordings, 1/s
+_FRAME_RATE = 16.0  # of recordings, 1/s: a page goes smoothly from one to the next
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -90,7 +90,7 @@ def _simulate_live(arguments: argparse.Namespace, scenario: "Scenario") -> int:
 
     terminal = sys.stdin is not None and sys.stdin.isatty()
     meshcat = start_meshcat(scenario.visualization)
-    print(f"meshcat: {meshcat.web_url()}", flush=True)
+    print(f"meshcat: {meshcat.web_url()} (keys: space pauses, N steps, R restarts)", flush=True)
     patience = arguments.wait if arguments.wait is not None else 60.0 if terminal else 0.0
     if patience > 0 and not wait_for_browser(meshcat, patience):
         print(f"no browser within {patience:g} s: going on without", flush=True)

@@ -1,5 +1,6 @@
 """Meshcat as the scenario wants it: a server on this machine, what it shows, and its buttons."""
 
+import math
 import select
 import sys
 import time
@@ -32,7 +33,8 @@ class Visualization:
     port: int | None = None
     # Time between two updates of the scene (s).
     publish_period: float = 1.0 / 32.0
-    # Also shows contact forces, 5 cm for 10 N, and collision geometry (hidden at first).
+    # Also shows contact forces of 0.5 N and more, 5 cm for 10 N, and collision geometry (hidden at
+    # first).
     contacts: bool = True
     proximity: bool = False
 
@@ -45,8 +47,8 @@ class Visualization:
 
 
 # Where one looks from and at (m, in W), and how wide (degrees, from top to bottom).
-_CAMERA, _CAMERA_TARGET, _CAMERA_FIELD = [1.55, -0.95, 0.85], [0.30, 0.03, 0.22], 40.0
-_NEWTONS_PER_METER = 200.0
+_CAMERA, _CAMERA_TARGET, _CAMERA_FIELD = [1.75, -0.95, 0.95], [0.22, 0.0, 0.27], 40.0
+_NEWTONS_PER_METER, _LEAST_FORCE = 200.0, 0.5  # N/m, N
 _POLL = 0.02  # s between two looks at the buttons or at the connections
 
 
@@ -171,6 +173,8 @@ def add_visualizers(
             publish_period=config.publish_period,
             prefix="contact_forces",
             newtons_per_meter=_NEWTONS_PER_METER,
+            force_threshold=_LEAST_FORCE,
+            moment_threshold=math.inf,
             color=Rgba(1.0, 0.0, 0.0),
         )
         ContactVisualizer.AddToBuilder(

@@ -9,10 +9,11 @@ import base64
 import functools
 import json
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 from pydrake.common import MemoryFile
 from pydrake.common.value import AbstractValue, Value
 from pydrake.geometry import InMemoryMesh, Mesh, Meshcat, Rgba
@@ -37,10 +38,9 @@ _COLORS = {"target": TARGET_COLOR, "grasped": GRASPED_COLOR}
 _MODES_SHOWN = 5  # of each waypoint
 _IMAGE_WIDTH = 160  # px, at most, of the images shown
 _FRUSTUM_DEPTH = 0.16  # m
-_LINE_LENGTH = 38  # characters of the text beside the scene
-_SHELF = np.array([-0.55, 0.0, 0.12])  # m in W: where the demonstrations stand, behind the robot
-_SHELF_SPACING = np.array([0.42, 0.38])  # m along y from one to the next, along z between waypoints
-_SHELF_SCALE = 0.7
+_SHELF = np.array([-0.55, -0.32, 0.12])  # m in W: where the demonstrations stand, behind the robot
+_SHELF_SPACING = np.array([0.30, 0.32])  # m along y from one to the next, along z between waypoints
+_SHELF_SCALE = 0.8
 
 
 class _View(LeafSystem):
@@ -303,12 +303,14 @@ class CameraViews(_View):
         if image.width() == 0:
             return
         path = f"{self._path}/{name}/image at {seen_at:.2f} s"
-        self._meshcat.SetObject(path, _textured(_corners(info) * _FRUSTUM_DEPTH, image.data))
+        step = -(-image.width() // _IMAGE_WIDTH)
+        pixels = image.data[::step, ::step]
+        self._meshcat.SetObject(path, _textured(_corners(info) * _FRUSTUM_DEPTH, pixels))
         self._appear(context, name, f"image at {seen_at:.2f} s")
 
 
 class PhaseText(_View):
-    """Says beside the scene which phase the policy is in, why, and what it has inferred.
+    """Says on the page which phase the policy is in, why, and what it has inferred.
 
     .. pydrake_system::
 
@@ -318,7 +320,7 @@ class PhaseText(_View):
         - chosen
         - estimates
 
-    All three are the policy's. The lines stand in Meshcat's panel of controls, below the buttons.
+    All three are the policy's. The lines stand at the top of the page, wherever one looks from.
     """
 
     def __init__(self, meshcat: Meshcat, motion: TaskMotion, *, period: float) -> None:
@@ -358,31 +360,34 @@ _NO_STATUS = PolicyStatus(
     phase=Phase.OBSERVE, timeline=(PhaseEntry(time=0.0, phase=Phase.OBSERVE),)
 )
 _FRUSTUM_COLOR = Rgba(0.25, 0.25, 0.3, 1.0)
-# Lines of text are buttons without effect: this mark, which one doesn't see, tells them from
-# buttons to press, and a line that stands there twice from its twin.
-_TEXT_MARK = "\u200b"
+# The text hangs before the camera, so near that nothing comes between: left, top, width of a pixel.
+_TEXT_PATH = "/Cameras/default/rotated/<object>/text"
+_TEXT_DISTANCE, _TEXT_PIXEL, _TEXT_TOP = 0.1, 0.1 * 6.2e-4, 0.1 * 0.355
+_TEXT_SIZE, _TEXT_LENGTH = 28, 66  # px of the letters, characters of a line
 
 
-def show_text(meshcat: Meshcat, lines: Iterable[str]) -> None:
-    """Shows lines of text in Meshcat's panel of controls, in place of those shown before."""
-    for name in meshcat.GetButtonNames():
-        if name.startswith(_TEXT_MARK):
-            meshcat.DeleteButton(name)
-    number = 0
-    for line in lines:
-        # Meshcat puts a name between quotes into a script.
-        plain = "".join(c if c.isprintable() else " " for c in line)
-        plain = plain.translate(str.maketrans({"'": "\u2019", '"': "\u201d", "\\": "/"}))
-        for part in textwrap.wrap(plain, _LINE_LENGTH, subsequent_indent="\u00a0\u00a0"):
-            number += 1
-            meshcat.AddButton(_TEXT_MARK * number + part)
-
-
-def shown_text(meshcat: Meshcat) -> list[str]:
-    """The lines that `show_text` shows now, as they are broken."""
-    names = [name for name in meshcat.GetButtonNames() if name.startswith(_TEXT_MARK)]
-    names.sort(key=lambda name: len(name) - len(name.lstrip(_TEXT_MARK)))
-    return [name.lstrip(_TEXT_MARK) for name in names]
+def show_text(meshcat: Meshcat, lines: Sequence[str]) -> None:
+    """Shows lines of text at the top of the page, in place of those shown before. Their words are
+    the name of the object in the scene's tree as well."""
+    meshcat.Delete(_TEXT_PATH)
+    if not lines:
+        return
+    broken = [part for line in lines for part in textwrap.wrap(line, _TEXT_LENGTH)]
+    font = ImageFont.load_default(size=_TEXT_SIZE)
+    row, margin = round(1.35 * _TEXT_SIZE), _TEXT_SIZE // 2
+    width = 2 * margin + max(int(font.getlength(line)) for line in broken)
+    height = margin + row * len(broken)
+    picture = Image.new("RGBA", (width, height), (250, 250, 250, 255))
+    draw = ImageDraw.Draw(picture)
+    for number, line in enumerate(broken):
+        draw.text((margin, margin // 3 + row * number), line, (20, 25, 30, 255), font=font)
+    x, y = _TEXT_PIXEL * width / 2, _TEXT_PIXEL * height
+    corners = np.array([[-x, 0.0], [x, 0.0], [x, -y], [-x, -y]]) + [0.0, _TEXT_TOP]
+    # In the camera's frame: x right, y up.
+    corners = np.column_stack([corners, np.full(4, -_TEXT_DISTANCE)])
+    words = " | ".join(lines).replace("/", "\u2215")
+    path = f"{_TEXT_PATH}/{words}"
+    meshcat.SetObject(path, _textured(corners, np.array(picture)))
 
 
 def show_demonstrated(
@@ -448,11 +453,11 @@ def add_policy_views(
     """
     show_demonstrated(meshcat, demonstrations)
     for name, view in (
-        ("observed_clouds", ObservedClouds(meshcat, motion, period=period)),
-        ("predicted_poses", PredictedPoses(meshcat, motion, period=period)),
-        ("waypoints_ahead", WaypointsAhead(meshcat, period=period)),
-        ("camera_views", CameraViews(meshcat, cameras, period=period)),
-        ("phase_text", PhaseText(meshcat, motion, period=period)),
+        ("view.observed_clouds", ObservedClouds(meshcat, motion, period=period)),
+        ("view.predicted_poses", PredictedPoses(meshcat, motion, period=period)),
+        ("view.waypoints_ahead", WaypointsAhead(meshcat, period=period)),
+        ("view.camera_views", CameraViews(meshcat, cameras, period=period)),
+        ("view.phase_text", PhaseText(meshcat, motion, period=period)),
     ):
         builder.AddNamedSystem(name, view)
         for index in range(view.num_input_ports()):
@@ -509,9 +514,7 @@ def _corners(info: CameraInfo) -> np.ndarray:
 
 
 def _textured(corners: np.ndarray, pixels: np.ndarray) -> Mesh:
-    """A plane with the corners (4, 3) of `_corners` that shows `pixels` (H, W, 4), made smaller."""
-    step = max(1, -(-pixels.shape[1] // _IMAGE_WIDTH))
-    pixels = pixels[::step, ::step]
+    """A plane that shows `pixels` (H, W, 4), with corners (4, 3) in the order of `_corners`."""
     image = ImageRgba8U(pixels.shape[1], pixels.shape[0])
     image.mutable_data[:] = pixels
     picture = ImageIo().Save(image, ImageFileFormat.kPng)

@@ -14,9 +14,9 @@ from pydrake.perception import BaseField, Fields, PointCloud
 from iga_drake.demonstrations.demonstration import DemonstrationSet
 from iga_drake.files import write_text
 
-TARGET_COLOR = Rgba(0.10, 0.45, 0.85, 1.0)
+TARGET_COLOR = Rgba(0.10, 0.62, 0.95, 1.0)
 GRASPED_COLOR = Rgba(0.95, 0.55, 0.10, 1.0)
-PREDICTED_COLOR = Rgba(0.15, 0.70, 0.30, 1.0)
+PREDICTED_COLOR = Rgba(0.45, 0.85, 0.15, 1.0)
 OTHER_MODE_COLOR = Rgba(0.45, 0.35, 0.60, 1.0)
 PATH_COLOR = Rgba(0.85, 0.15, 0.45, 1.0)
 EXPERT_COLOR = Rgba(0.95, 0.80, 0.10, 1.0)

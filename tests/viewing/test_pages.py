@@ -22,6 +22,8 @@ FIND = """
 }
 """
 
+FIND_TEXT = "viewer.scene_tree.find(['Cameras', 'default', 'rotated', '<object>', 'text']).children"
+
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
@@ -58,8 +60,9 @@ def test_live_page(browser):
             if entry.phase.value == "infer"
         )
         browser.wait_for(has_shape(image))  # a textured plane, which loads by itself
-        words = browser.evaluate("document.body.innerText")
-        assert "move grasp" in words and "step: " in words
+        words = "Object.keys(viewer.camera.children.length ? " + FIND_TEXT + " : {}).join()"
+        browser.wait_for(words)
+        assert "move grasp" in browser.evaluate(words)
 
         def click(name: str) -> None:
             script = (

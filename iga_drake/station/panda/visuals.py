@@ -22,7 +22,7 @@ _MESHES = {
 _VERSION = "3"  # of the conversion
 # Share of the triangles of a part that are dropped if it has more than few, where the package
 # fast-simplification is there; angle (rad) from which on an edge is seen as one.
-_SHARE_DROPPED, _FEW_FACES, _CREASE = 0.7, 300, math.radians(35.0)
+_SHARE_DROPPED, _FEW_FACES, _CREASE = 0.75, 300, math.radians(35.0)
 
 
 def _source_dir() -> Path | None:
