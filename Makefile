@@ -25,7 +25,7 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: check
+test: check $(VENV)/.browser
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --nbmake tests notebooks
 
 clean:
@@ -47,6 +47,17 @@ $(VENV)/.system:
 	  fi; \
 	fi
 	@mkdir -p $(VENV) && touch $@
+
+# Pages are tested in headless Chromium; where it is missing and can't be installed, these tests are
+# left out.
+$(VENV)/.browser: | $(VENV)/.system
+	@if ! command -v chromium >/dev/null 2>&1 && ! command -v chromium-browser >/dev/null 2>&1; then \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null 2>&1; then \
+	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium; \
+	  else \
+	    echo "no chromium: tests of pages are left out; sudo apt-get install chromium" >&2; exit 0; \
+	  fi; \
+	fi; touch $@
 
 $(BIN)/python: | $(VENV)/.system
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

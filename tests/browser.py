@@ -14,8 +14,10 @@ from typing import Any
 import pytest
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+# Where a browser has to be there, its lack is an error.
 needs_browser = pytest.mark.skipif(
-    CHROMIUM is None and not os.environ.get("CI"), reason="no chromium: apt-get install chromium"
+    CHROMIUM is None and not os.environ.get("IGA_NEEDS_BROWSER"),
+    reason="no chromium: apt-get install chromium",
 )
 
 
@@ -126,6 +128,11 @@ class Browser:
         while not self.evaluate(f"Boolean({script})"):
             assert time.monotonic() < end, f"not within {timeout} s: {script}; {self.errors}"
             time.sleep(0.05)
+
+    def press(self, code: str) -> None:
+        """Presses a key, named as in JavaScript: "Space", "KeyN"."""
+        self.command("Input.dispatchKeyEvent", type="keyDown", code=code)
+        self.command("Input.dispatchKeyEvent", type="keyUp", code=code)
 
     def picture(self, path: Path, **options: Any) -> None:
         """Writes what is seen as a picture; `options` of `Page.captureScreenshot`."""

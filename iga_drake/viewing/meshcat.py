@@ -49,6 +49,7 @@ class Visualization:
 # Where one looks from and at (m, in W), and how wide (degrees, from top to bottom).
 _CAMERA, _CAMERA_TARGET, _CAMERA_FIELD = [1.75, -0.95, 0.95], [0.22, 0.0, 0.27], 40.0
 _NEWTONS_PER_METER, _LEAST_FORCE = 200.0, 0.5  # N/m, N
+_CONTACT_PERIOD = 0.1  # s at least: one contact is many numbers in a recording
 _POLL = 0.02  # s between two looks at the buttons or at the connections
 
 
@@ -170,7 +171,7 @@ def add_visualizers(
         MeshcatVisualizer.AddToBuilder(builder, query, meshcat, params)
     if config.contacts:
         contacts = ContactVisualizerParams(
-            publish_period=config.publish_period,
+            publish_period=max(config.publish_period, _CONTACT_PERIOD),
             prefix="contact_forces",
             newtons_per_meter=_NEWTONS_PER_METER,
             force_threshold=_LEAST_FORCE,

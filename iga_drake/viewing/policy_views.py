@@ -21,8 +21,9 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.systems.sensors import CameraInfo, ImageFileFormat, ImageIo, ImageRgba8U
 
+from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.demonstrations.demonstration import DemonstrationSet
-from iga_drake.policy.motion import Phase, PhaseEntry, PolicyStatus, TaskMotion
+from iga_drake.policy.motion import Phase, PhaseEntry, PolicyStatus, ReachablePose, TaskMotion
 from iga_drake.viewing.replay import (
     EXPERT_COLOR,
     GRASPED_COLOR,
@@ -149,8 +150,8 @@ class PredictedPoses(_View):
         - status
 
     All four are the policy's. The name of each mode in the scene's tree tells its energy and
-    probability. The chosen one is green; the others are the fainter the less probable they are, and
-    go when the waypoint is reached.
+    probability. The chosen one is green; the others, five at most, are the fainter the less
+    probable they are, and go when the waypoint is reached.
     """
 
     def __init__(
@@ -163,33 +164,32 @@ class PredictedPoses(_View):
         self._declare("status", _NO_STATUS)
 
     def _publish(self, context: Context) -> None:
-        chosen = self._read(context, "chosen")
-        for index, estimate in enumerate(self._read(context, "estimates")):
+        chosen, estimates = self._read(context, "chosen"), self._read(context, "estimates")
+        for index, estimate in enumerate(estimates):
             if self._is_new(f"estimate {index}", id(estimate)):
                 self._show_modes(context, index, estimate)
         for index, pose in enumerate(chosen):
             if self._is_new(f"chosen {index}"):
                 self._show_chosen(context, index, pose)
+                words = _mode_words(estimates[index], pose.mode)
+                self._vanish(context, self._motion.waypoints[index].name, "modes", words)
         for index in range(len(self._read(context, "status").waypoints_reached)):
             if self._is_new(f"reached {index}"):
                 self._vanish(context, self._motion.waypoints[index].name, "modes")
 
-    def _show_modes(self, context: Context, index: int, estimate: Any) -> None:
-        name, count = self._motion.waypoints[index].name, len(estimate.poses)
+    def _show_modes(self, context: Context, index: int, estimate: PoseEstimate) -> None:
+        name = self._motion.waypoints[index].name
         best = max(float(estimate.probabilities.max()), 1e-9)
-        for mode in range(min(count, _MODES_SHOWN)):
+        for mode in range(min(len(estimate.poses), _MODES_SHOWN)):
             share = float(estimate.probabilities[mode])
-            words = (
-                f"mode {mode + 1} of {count}: energy {estimate.energies[mode]:.3f}, "
-                f"probability {share:.2f}"
-            )
+            words = _mode_words(estimate, mode)
             color = OTHER_MODE_COLOR
             color = Rgba(color.r(), color.g(), color.b(), 0.25 + 0.5 * share / best)
             X_WE = RigidTransform(estimate.poses[mode])
             _show_hand(self._meshcat, f"{self._path}/{name}/modes/{words}", X_WE, color)
         self._appear(context, name, "modes")
 
-    def _show_chosen(self, context: Context, index: int, pose: Any) -> None:
+    def _show_chosen(self, context: Context, index: int, pose: ReachablePose) -> None:
         waypoint = self._motion.waypoints[index]
         path = f"{self._path}/{waypoint.name}/chosen"
         _show_hand(self._meshcat, f"{path}/hand", pose.X_WE, PREDICTED_COLOR)
@@ -236,10 +236,10 @@ class WaypointsAhead(_View):
             )
             if self._is_new(name, (X_WE.GetAsMatrix34().tobytes(), index == 0 and planned)):
                 path = f"{self._path}/{name}"
-                show_triad(self._meshcat, f"{path}/X_WE", X_WE, length=0.05)
+                show_triad(self._meshcat, f"{path}/X_WE", X_WE, length=0.07)
                 if planned:
-                    dots = _resampled(way, 0.012)
-                    show_cloud(self._meshcat, f"{path}/way", dots, PATH_COLOR, 0.005)
+                    dots = _resampled(way, 0.015)
+                    show_cloud(self._meshcat, f"{path}/way", dots, PATH_COLOR, 0.010)
                 self._appear(context, name)
             before = X_WE
 
@@ -346,12 +346,8 @@ class PhaseText(_View):
         if status.reason:
             lines.append(f"reason: {status.reason}")
         for index, estimate in enumerate(estimates):
-            name, count = self._motion.waypoints[index].name, len(estimate.poses)
             mode = chosen[index].mode if index < len(chosen) else 0
-            lines.append(
-                f"{name}: mode {mode + 1} of {count}, energy {estimate.energies[mode]:.3f}, "
-                f"probability {estimate.probabilities[mode]:.2f}"
-            )
+            lines.append(f"{self._motion.waypoints[index].name}: {_mode_words(estimate, mode)}")
         if self._is_new("text", lines):
             show_text(self._meshcat, lines)
 
@@ -463,6 +459,13 @@ def add_policy_views(
         for index in range(view.num_input_ports()):
             port = view.get_input_port(index)
             builder.Connect(outputs[port.get_name()], port)
+
+
+def _mode_words(estimate: PoseEstimate, mode: int) -> str:
+    return (
+        f"mode {mode + 1} of {len(estimate.poses)}, energy {estimate.energies[mode]:.3f}, "
+        f"probability {estimate.probabilities[mode]:.2f}"
+    )
 
 
 # Shapes

@@ -1,12 +1,12 @@
 """The live page and a replay in a real browser: objects are found, nothing fails."""
 
 import json
-import threading
+import time
 from pathlib import Path
 
 import pytest
 from browser import Browser, needs_browser
-from view_fixtures import END, shown_run
+from view_fixtures import END, ENERGIES, PROBABILITIES, shown_run
 
 from iga_drake.viewing.meshcat import RunButtons, wait_for_browser
 from iga_drake.viewing.replay import replay_html
@@ -31,6 +31,14 @@ def browser(tmp_path_factory):
         yield browser
 
 
+class Waits(Exception):
+    """Takes the place of the module `time`: raised where it is slept."""
+
+    @staticmethod
+    def sleep(seconds: float) -> None:
+        raise Waits
+
+
 def has_shape(path: str) -> str:
     """Script: whether something with a surface, line or points hangs below `path`."""
     return (
@@ -43,7 +51,7 @@ def is_visible(path: str) -> str:
     return f"({FIND})({json.dumps(path)}).visible"
 
 
-def test_live_page(browser):
+def test_live_page(browser, monkeypatch):
     meshcat = shown_run().meshcat
     buttons = RunButtons(meshcat)
     try:
@@ -60,9 +68,15 @@ def test_live_page(browser):
             if entry.phase.value == "infer"
         )
         browser.wait_for(has_shape(image))  # a textured plane, which loads by itself
-        words = "Object.keys(viewer.camera.children.length ? " + FIND_TEXT + " : {}).join()"
-        browser.wait_for(words)
-        assert "move grasp" in browser.evaluate(words)
+        assert "move grasp" in browser.evaluate(f"Object.keys({FIND_TEXT}).join()")
+        # It hangs before the camera; the chosen mode is shown as such alone.
+        browser.wait_for("viewer.camera.children.length")
+        first, second = (
+            f"predicted/grasp/modes/mode {k + 1} of 2, energy {ENERGIES[k]:.3f}, "
+            f"probability {PROBABILITIES[k]:.2f}"
+            for k in range(2)
+        )
+        assert not browser.evaluate(is_visible(first)) and browser.evaluate(is_visible(second))
 
         def click(name: str) -> None:
             script = (
@@ -75,19 +89,17 @@ def test_live_page(browser):
             for _ in range(500):
                 if meshcat.GetButtonClicks(name) > before:
                     return
-                threading.Event().wait(0.02)
+                time.sleep(0.02)
             pytest.fail(f"a click on '{name}' didn't arrive")
 
         assert buttons.proceed()
         click(RunButtons.STEP)  # pauses, and lets one step through
         assert buttons.proceed()
-        waiting = threading.Thread(target=buttons.proceed, daemon=True)
-        waiting.start()
-        waiting.join(0.2)
-        assert waiting.is_alive()
+        with monkeypatch.context() as patch, pytest.raises(Waits):
+            patch.setattr("iga_drake.viewing.meshcat.time", Waits)
+            buttons.proceed()
         click(RunButtons.PAUSE)
-        waiting.join(30.0)
-        assert not waiting.is_alive() and buttons.proceed()
+        assert buttons.proceed() and buttons.proceed()
         click(RunButtons.RESTART)
         assert buttons.restarts and not buttons.proceed()
     finally:

@@ -20,7 +20,7 @@ def test_the_observed_cloud_is_shown():
 def test_every_mode_is_shown_with_its_energy_and_probability():
     meshcat = shown_run().meshcat
     for mode, (energy, share) in enumerate(zip(ENERGIES, PROBABILITIES, strict=True)):
-        words = f"mode {mode + 1} of 2: energy {energy:.3f}, probability {share:.2f}"
+        words = f"mode {mode + 1} of 2, energy {energy:.3f}, probability {share:.2f}"
         assert meshcat.HasPath(f"/drake/predicted/grasp/modes/{words}")
     assert meshcat.HasPath("/drake/predicted/grasp/chosen/hand")
 
