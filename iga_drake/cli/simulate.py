@@ -9,7 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from iga_drake.cli.options import add_aligner_options, aligner_options, seed
-from iga_drake.cli.scenarios import add_scenario_arguments, scenario_of, with_aligner
+from iga_drake.cli.scenarios import (
+    add_demonstrations_argument,
+    add_scenario_arguments,
+    scenario_of,
+    with_aligner,
+)
 from iga_drake.cli.status import FAILURE, SUCCESS
 from iga_drake.files import check_output, write_text
 
@@ -26,7 +31,8 @@ _FRAME_RATE = 16.0  # of recordings, 1/s: a page goes smoothly from one to the n
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga simulate`."""
     add_scenario_arguments(parser)
-    parser.add_argument("--seed", type=seed, default=0, help="scene, noise and aligner (default 0)")
+    add_demonstrations_argument(parser)
+    parser.add_argument("--seed", type=seed, default=0, help="scene, noise and aligner")
     parser.add_argument(
         "--aligner", metavar="NAME",
         help="default: the scenario's; expert: poses of the scripted expert, which sees all",
@@ -127,6 +133,9 @@ def _simulate(
     with Episode(scenario, seed=seed, split=split, meshcat=meshcat) as episode:
         name = scenario.aligner.name
         print(f"{episode.task.name}, seed {seed}, aligner {name}, {split} objects", flush=True)
+        if arguments.demonstrations and episode.demonstrations is not None:
+            used = len(episode.demonstrations)
+            print(f"    the first {used} demonstrations of {arguments.demonstrations}", flush=True)
         run: dict[str, Any] = {"on_event": lambda line: print(line, flush=True)}
         if buttons is not None:
             run["proceed"] = _pacer(episode.simulator, buttons, arguments.realtime)
