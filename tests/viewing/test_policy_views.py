@@ -5,7 +5,7 @@ import pytest
 from pydrake.math import RigidTransform
 from view_fixtures import END, ENERGIES, PROBABILITIES, build_shown, shown_run
 
-from iga_drake.viewing.meshcat import start_meshcat, wait_for_browser
+from iga_drake.viewing.meshcat import start_meshcat
 from iga_drake.viewing.policy_views import show_text, show_verdict
 
 
@@ -85,7 +85,3 @@ def test_the_verdict_stands_beside_the_scene_and_the_expert_s_hand_in_it(meshcat
     assert meshcat.HasPath("/drake/expert/grasp")
     show_verdict(meshcat, "FAILURE", {}, 3.0)
     assert not meshcat.HasPath("/drake/expert")
-
-
-def test_a_browser_is_waited_for_no_longer_than_asked(meshcat):
-    assert not wait_for_browser(meshcat, 0.1)
