@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from iga_drake.station.scenario import Scenario
     from iga_drake.viewing.meshcat import RunButtons
 
-_FRAME_RATE = 16.0  # of recordings, 1/s: a page goes smoothly from one to the next
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga simulate`."""
@@ -126,10 +124,9 @@ def _simulate(
 
     live, split = buttons is not None, arguments.split
     if meshcat is not None:
-        meshcat.DeleteRecording()
-        meshcat.StartRecording(
-            frames_per_second=_FRAME_RATE, set_visualizations_while_recording=live
-        )
+        from iga_drake.viewing.replay import begin_recording
+
+        begin_recording(meshcat, live=live)
     with Episode(scenario, seed=seed, split=split, meshcat=meshcat) as episode:
         name = scenario.aligner.name
         print(f"{episode.task.name}, seed {seed}, aligner {name}, {split} objects", flush=True)
@@ -144,15 +141,12 @@ def _simulate(
         return FAILURE
     if meshcat is not None:
         from iga_drake.viewing.policy_views import show_verdict
+        from iga_drake.viewing.replay import end_recording, replay_html
 
         experts = {waypoint.name: waypoint.X_WE_expert for waypoint in result.waypoints}
         show_verdict(meshcat, str(result), experts, result.simulated_seconds)
-        meshcat.StopRecording()
-        meshcat.get_mutable_recording().set_autoplay(False)
-        meshcat.PublishRecording()
+        end_recording(meshcat)
         if arguments.html:
-            from iga_drake.viewing.replay import replay_html
-
             write_text(arguments.html, replay_html(meshcat, result.row()))
             print(f"replay: {arguments.html}")
     if arguments.result:

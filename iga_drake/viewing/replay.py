@@ -19,6 +19,7 @@ GRASPED_COLOR = Rgba(0.95, 0.55, 0.10, 1.0)
 PREDICTED_COLOR = Rgba(0.45, 0.85, 0.15, 1.0)
 OTHER_MODE_COLOR = Rgba(0.45, 0.35, 0.60, 1.0)
 PATH_COLOR = Rgba(0.85, 0.15, 0.45, 1.0)
+_FRAME_RATE = 16.0  # of recordings, 1/s: a page goes smoothly from one to the next
 EXPERT_COLOR = Rgba(0.95, 0.80, 0.10, 1.0)
 
 
@@ -70,6 +71,19 @@ def show_triad(meshcat: Meshcat, path: str, X_WF: RigidTransform, length: float 
         meshcat.SetObject(f"{path}/{name}", Cylinder(0.025 * length, length), Rgba(*color, 1.0))
         meshcat.SetTransform(f"{path}/{name}", RigidTransform(R, p))
     meshcat.SetTransform(path, X_WF)
+
+
+def begin_recording(meshcat: Meshcat, *, live: bool) -> None:
+    """Records from now on, and forgets what was recorded before; `live`: it is seen as well."""
+    meshcat.DeleteRecording()
+    meshcat.StartRecording(frames_per_second=_FRAME_RATE, set_visualizations_while_recording=live)
+
+
+def end_recording(meshcat: Meshcat) -> None:
+    """Ends the recording and gives it to the page, which doesn't play it unasked."""
+    meshcat.StopRecording()
+    meshcat.get_mutable_recording().set_autoplay(False)
+    meshcat.PublishRecording()
 
 
 def replay_html(meshcat: Meshcat, episode: Mapping[str, Any]) -> str:

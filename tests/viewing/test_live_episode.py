@@ -1,64 +1,62 @@
-"""One whole episode watched in a browser, from the first picture to the replay.
+"""One whole episode looked at in a browser, live and as a replay.
 
 With IGA_PICTURES=DIR the pictures of the documentation are written there.
 """
 
-import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 from browser import Browser, needs_browser
 
-SIZE = {"width": 1280, "height": 720} if os.environ.get("IGA_PICTURES") else {
-    "width": 480, "height": 300,
-}  # fmt: skip
-TEXT = "['Cameras', 'default', 'rotated', '<object>', 'text']"
+from iga_drake import Episode, load_scenario
+from iga_drake.policy.motion import Phase
+from iga_drake.viewing.meshcat import start_meshcat
+from iga_drake.viewing.replay import begin_recording, end_recording, replay_html
+
+JPEG = {"format": "jpeg", "quality": 80}
+# Of a picture, s: the bowl is on its way.
+MOMENT = 3.2
 
 
-def says(words: str) -> str:
-    """Script: whether the text at the top of the live page has these words."""
-    found = f"Object.keys(viewer.scene_tree.find({TEXT}).children).join().includes"
-    return f"typeof viewer == 'object' && {found}({json.dumps(words)})"
+def is_drawn(path: list[str]) -> str:
+    """Script: whether something is drawn below a path of the scene's tree."""
+    return (
+        "(() => { let found = false;"
+        f" viewer.scene_tree.find({path}).object.traverse(o => {{ found = found || o.geometry; }});"
+        " return found; })()"
+    )
 
 
 @needs_browser
-def test_an_episode_is_watched_paused_and_kept_as_a_replay(tmp_path: Path):
-    page, row = tmp_path / "stack.html", tmp_path / "stack.json"
+def test_an_episode_is_looked_at_live_and_as_a_replay(tmp_path: Path):
     pictures = Path(os.environ.get("IGA_PICTURES", tmp_path))
-    options = {"format": "jpeg", "quality": 82}
-    command = [
-        sys.executable, "-m", "iga_drake.cli", "simulate", "stack", "--seed", "3", "--meshcat",
-        "--wait", "120", "--stay", "--html", str(page), "--result", str(row),
-    ]  # fmt: skip
-    with (
-        Browser(tmp_path / "browser", **SIZE) as browser,
-        subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True) as p,
-    ):
-        try:
-            assert p.stdout is not None
-            browser.open(p.stdout.readline().split()[1])
-            browser.wait_for(says("move stack"), timeout=900.0)
-            browser.press("Space")
-            for path in ("observed", "predicted", "ahead", "cameras", "demonstrations"):
-                browser.wait_for(f"viewer.scene_tree.children.drake.children.{path}")
-            browser.picture(pictures / "live.jpg", **options)
-            browser.press("Space")
-            browser.wait_for(says("SUCCESS"), timeout=900.0)
-            assert next(line for line in p.stdout if line.startswith("press Enter"))
-            browser.evaluate(
-                "[...document.querySelectorAll('.dg li.function')]"
-                ".find(e => e.innerText.trim() == 'end').click()"
-            )
-            assert p.wait(60.0) == 0
-        finally:
-            p.kill()
-        assert browser.errors == []
-        assert json.loads(row.read_text())["success"] is True
-        assert page.stat().st_size <= 6e6
-        browser.open(page.as_uri() + "#t=3.5")
-        browser.wait_for("typeof iga == 'object' && iga.ready()")
+    scenario = load_scenario("stack", overrides=["policy.infer_limit=600"])
+    meshcat = start_meshcat(scenario.visualization)
+    begin_recording(meshcat, live=True)
+    with Episode(scenario, seed=3, meshcat=meshcat) as episode:
+        status = episode.step(MOMENT)
+        assert status.phase is Phase.MOVE, status.reason
+        with Browser(tmp_path / "live", width=1280, height=720) as browser:
+            browser.open(meshcat.web_url())
+            browser.wait_for("typeof viewer == 'object' && viewer.scene_tree.children.drake", 120.0)
+            seen = max(observation.time for observation in episode.memory.observations.values())
+            image = ["drake", "cameras", "camera_0", f"image at {seen:.2f} s"]
+            text = ["Cameras", "default", "rotated", "<object>", "text"]
+            for path in (image, text, ["drake", "illustration", "panda", "panda_link7"]):
+                browser.wait_for(is_drawn(path), 120.0)
+            browser.picture(pictures / "live.jpg", **JPEG)
+            assert browser.errors == []
+        result = episode.run()
+        row = result.row()
+        end_recording(meshcat)
+    page = tmp_path / "stack.html"
+    page.write_text(replay_html(meshcat, row), encoding="utf-8")
+    assert result.success and page.stat().st_size <= 6e6
+    with Browser(tmp_path / "replay", width=1280, height=720) as browser:
+        browser.open(f"{page.as_uri()}#t={MOMENT}")
+        browser.wait_for("typeof iga == 'object' && iga.ready()", 120.0)
         assert "SUCCESS" in browser.evaluate("document.body.innerText")
-        browser.picture(pictures / "replay.jpg", **options)
+        link = ["drake", "illustration", "panda", "panda_link7"]
+        browser.wait_for(is_drawn(link), 120.0)
+        browser.picture(pictures / "replay.jpg", **JPEG)
         assert browser.errors == []

@@ -14,6 +14,7 @@ from iga_drake.policy.motion import Phase, PolicyStatus
 from iga_drake.tasks.grasp import Grasp
 from iga_drake.tasks.robot_diagram import RobotDiagram, build_robot_diagram
 from iga_drake.viewing.meshcat import start_meshcat
+from iga_drake.viewing.replay import begin_recording, end_recording
 
 # Of the two modes that the stub's aligner answers with.
 ENERGIES, PROBABILITIES = (-2.5, -1.25), (0.75, 0.25)
@@ -63,12 +64,10 @@ class Shown:
 def shown_run() -> Shown:
     """The same run for all tests of a process."""
     meshcat = start_meshcat()
-    meshcat.StartRecording(frames_per_second=32.0)
+    begin_recording(meshcat, live=True)
     robot, simulator = build_shown(meshcat)
     simulator.AdvanceTo(END)
-    meshcat.StopRecording()
-    meshcat.get_mutable_recording().set_autoplay(False)
-    meshcat.PublishRecording()
+    end_recording(meshcat)
     shown = Shown(meshcat, robot, simulator)
     assert shown.status.phase is Phase.MOVE, shown.status
     return shown
