@@ -36,7 +36,7 @@ from iga_drake.viewing.replay import (
 )
 
 _COLORS = {"target": TARGET_COLOR, "grasped": GRASPED_COLOR}
-_MODES_SHOWN = 5  # of each waypoint
+_MODES_SHOWN, _MODES_TOLD = 5, 3  # of each waypoint, drawn and in the text
 _IMAGE_WIDTH = 160  # px, at most, of the images shown
 _FRUSTUM_DEPTH = 0.16  # m
 _SHELF = np.array([-0.55, -0.32, 0.12])  # m in W: where the demonstrations stand, behind the robot
@@ -346,8 +346,12 @@ class PhaseText(_View):
         if status.reason:
             lines.append(f"reason: {status.reason}")
         for index, estimate in enumerate(estimates):
-            mode = chosen[index].mode if index < len(chosen) else 0
-            lines.append(f"{self._motion.waypoints[index].name}: {_mode_words(estimate, mode)}")
+            name = self._motion.waypoints[index].name
+            mode = chosen[index].mode if index < len(chosen) else None
+            latest = index == len(estimates) - 1
+            for k in range(min(len(estimate.poses), _MODES_TOLD)):
+                if latest or k == mode:
+                    lines.append(f"{name}: {_mode_words(estimate, k)}{', chosen' * (k == mode)}")
         if self._is_new("text", lines):
             show_text(self._meshcat, lines)
 

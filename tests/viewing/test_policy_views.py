@@ -44,8 +44,9 @@ def test_the_text_tells_phase_step_and_mode():
     """Its words are the name of what is drawn."""
     status = shown_run().status
     words = (
-        f"{time_of('move'):.2f} s  move grasp | step: {status.step} | grasp: mode 1 of 2, "
-        "energy -2.500, probability 0.75"
+        f"{time_of('move'):.2f} s  move grasp | step: {status.step}"
+        " | grasp: mode 1 of 2, energy -2.500, probability 0.75, chosen"
+        " | grasp: mode 2 of 2, energy -1.250, probability 0.25"
     )
     assert shown_run().meshcat.HasPath(f"/Cameras/default/rotated/<object>/text/{words}")
 
