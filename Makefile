@@ -50,7 +50,7 @@ docs: develop
 	$(BIN)/python -m mkdocs build --quiet --strict --config-file .ci/mkdocs.yml --site-dir $(CURDIR)/outputs/site
 	@echo "outputs/site/index.html"
 
-test: check docs
+test: check docs $(VENV)/.browser
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --nbmake tests notebooks
 
 # Many more inputs for the property tests; FUZZ_INPUTS of each, which follow from FUZZ_SEED.
@@ -104,3 +104,14 @@ $(VENV)/.test: pyproject.toml Makefile .ci/set_up.py | $(BIN)/python
 	$(call system_packages,$(TEST_PACKAGES))
 	$(call install_extras,$(TEST_EXTRAS))
 	@touch $(VENV)/.demo $@
+
+# Pages are tested in headless Chromium; where it is missing and can't be installed, these tests are
+# left out.
+$(VENV)/.browser: | $(BIN)/python
+	@if ! command -v chromium >/dev/null 2>&1 && ! command -v chromium-browser >/dev/null 2>&1; then \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null 2>&1; then \
+	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium; \
+	  else \
+	    echo "no chromium: tests of pages are left out; sudo apt-get install chromium" >&2; exit 0; \
+	  fi; \
+	fi; touch $@

@@ -243,7 +243,7 @@ class Episode:
         this one, or "expert" or "oracle"; default: the scenario's.
       split: whose objects: "test" (never demonstrated) or "demonstration".
       demonstrations: the aligner's context; default: the scenario's folder.
-      meshcat: where to show it.
+      meshcat: where to show it, and what the policy sees, infers and is about to do.
 
     Raises:
       IgaDrakeError: bad input. An episode that fails is a result, not an error.
@@ -284,6 +284,7 @@ class Episode:
                 inference=self.inference,
                 demonstrations=self.demonstrations,
                 seed=draws,
+                meshcat=meshcat,
             )
             if not self.robot.station.HasSubsystemNamed("plant"):
                 raise TaskError(
@@ -399,14 +400,20 @@ class Episode:
         self._wall_seconds += wall.perf_counter() - began
         return self.status
 
-    def run(self, on_event: Callable[[str], None] | None = None) -> EpisodeResult:
+    def run(
+        self,
+        on_event: Callable[[str], None] | None = None,
+        *,
+        proceed: Callable[[], bool] | None = None,
+    ) -> EpisodeResult:
         """Goes on until it is over, and judges.
 
         Args:
           on_event: called with one line of text for each phase and with the verdict.
+          proceed: called before each step, may take its time; where it returns False the run ends.
         """
         shown = 0
-        while not self.over:
+        while not self.over and (proceed is None or proceed()):
             timeline = self.step().timeline
             if on_event:
                 for entry in timeline[shown:]:

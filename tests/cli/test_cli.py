@@ -272,3 +272,40 @@ def test_exit_status_follows_the_verdict(monkeypatch, tmp_path: Path):
     assert cli.main([*command, "--seed", "1"]) == cli.SUCCESS
     assert json.loads(path.read_text())["success"] is True
     assert cli.main([*command, "--seed", "2"]) == cli.FAILURE
+
+
+def test_a_live_run_without_a_terminal_neither_waits_nor_stays(monkeypatch, capsys):
+    """A restart, here asked for once, begins again with the next seed."""
+    from types import SimpleNamespace
+
+    from iga_drake.tasks import episode
+    from iga_drake.viewing.meshcat import RunButtons
+
+    seeds, rates = [], []
+
+    class FakeEpisode:
+        def __init__(self, scenario, *, seed, split, meshcat):
+            self.task, self.seed = make_task(scenario.task.name), seed
+            seeds.append(seed)
+            self.simulator = SimpleNamespace(
+                set_target_realtime_rate=rates.append, ResetStatistics=lambda: None
+            )
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def run(self, on_event, proceed):
+            assert proceed() is (self.seed == 4)
+            return episode.EpisodeResult(
+                task="grasp", aligner="icp", seed=self.seed, split="test", scenario="", success=True
+            )
+
+    monkeypatch.setattr(episode, "Episode", FakeEpisode)
+    monkeypatch.setattr(RunButtons, "restarts", property(lambda self: seeds == [3]))
+    command = ["simulate", "grasp", "--aligner", "icp", "--meshcat", "--seed", "3"]
+    assert cli.main([*command, "--realtime", "0.5"]) == cli.SUCCESS
+    assert seeds == [3, 4] and rates == [0.5, 0.5]
+    assert "meshcat: http://localhost:" in capsys.readouterr().out
