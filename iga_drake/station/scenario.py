@@ -27,6 +27,7 @@ from iga_drake.policy.machine import PolicyConfig
 from iga_drake.station.cameras.clutter import Clutter
 from iga_drake.station.cameras.kinds import camera_type
 from iga_drake.station.cameras.rgbd import LookAt, RgbdCamera
+from iga_drake.station.declaration import TaskDeclaration
 from iga_drake.systems.differential_ik import DifferentialIkConfig
 from iga_drake.systems.fusion import FusionConfig
 from iga_drake.systems.ports import PANDA_JOINTS
@@ -103,10 +104,12 @@ def _cameras() -> dict[str, RgbdCamera]:
 class TaskChoice:
     """The task to do, by name, and its time limit."""
 
-    # Name in the task registry of `iga_drake.tasks`.
+    # Name in the task registry of `iga_drake.tasks`, or, with `declared`, a new one.
     name: str = "grasp"
     # Simulated time after which the episode has failed (s), > 0.
     time_limit: float = 120.0
+    # The task itself, where no registered one is meant.
+    declared: TaskDeclaration | None = None
 
 
 @dataclass
@@ -156,7 +159,8 @@ class Scenario:
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     task: TaskChoice = field(default_factory=TaskChoice)
     aligner: AlignerChoice = field(default_factory=AlignerChoice)
-    # Folder with the demonstrations; a relative path starts at `models/`.
+    # Folder with the demonstrations; a relative path starts at `models/`, that of a declared task
+    # at the scenario file.
     demonstrations: str = "demonstrations/grasp"
     # The first so many demonstrations make up the aligner's context; all if there are fewer.
     context_size: int = 3
@@ -170,8 +174,13 @@ class Scenario:
 
     @property
     def digest(self) -> str:
-        """First 16 hexadecimal digits of the SHA-256 of `to_yaml()`; file names don't matter."""
-        return hashlib.sha256(self.to_yaml().encode()).hexdigest()[:16]
+        """First 16 hexadecimal digits of the SHA-256 of `to_yaml()`; the file's own name and place
+        don't matter, but the content of the objects' files does."""
+        scenario = self
+        if self.task.declared is not None:
+            task = dataclasses.replace(self.task, declared=self.task.declared.portable())
+            scenario = dataclasses.replace(self, task=task)
+        return hashlib.sha256(scenario.to_yaml().encode()).hexdigest()[:16]
 
     def to_yaml(self) -> str:
         """The whole scenario, defaults included, as text that `load_scenario` reads back."""
@@ -217,6 +226,9 @@ def load_scenario(
                 f"{file}: {size} bytes, a scenario has at most {_LARGEST_FILE}: is it another file?"
             )
         scenario = _layered(scenario, text, str(file))
+        declared = scenario.task.declared
+        if declared is not None and not Path(declared.folder).is_absolute():
+            declared.folder = str((file.resolve().parent / declared.folder).resolve())
     for override in overrides:
         text = _override_text(override, scenario)
         scenario = _layered(scenario, text, _cut(override), keep_maps=True)
@@ -440,5 +452,7 @@ def _check_values(s: Scenario) -> None:
     s.policy.check("policy")
     s.visualization.check("visualization")
     check_bounds(s.task, "task", {"time_limit": (1e-3, 86_400.0)})
+    if s.task.declared is not None:
+        s.task.declared.check("task.declared")
     check_range(1 <= s.context_size <= 1000, "context_size", s.context_size, "1 to 1000")
     check_bounds(s.seeds, "seeds", dict.fromkeys(vars(s.seeds), (0, _MOST_SEED)))

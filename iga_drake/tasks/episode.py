@@ -39,7 +39,7 @@ from iga_drake.station.panda.model import find_panda
 from iga_drake.station.scenario import Scenario
 from iga_drake.systems.messages import Cause
 from iga_drake.tasks.pose_error import pose_error_at
-from iga_drake.tasks.registry import make_task
+from iga_drake.tasks.registry import scenario_task
 from iga_drake.tasks.robot_diagram import RobotDiagram, build_robot_diagram
 from iga_drake.tasks.snapshots import Snapshot, TaskError, read_snapshot
 from iga_drake.tasks.task import Split, Task
@@ -219,12 +219,15 @@ class ExpertInference:
 
 
 def demonstrations_path(scenario: Scenario) -> Path:
-    """The folder of the scenario's demonstrations; relative paths start at `models/`, `~` is the
-    user's home."""
+    """The folder of the scenario's demonstrations; relative paths start at `models/`, of a declared
+    task at the scenario file; `~` is the user's home."""
     path = Path(scenario.demonstrations)
     with contextlib.suppress(RuntimeError):  # no such user
         path = path.expanduser()
-    return path if path.is_absolute() else models_dir() / path
+    if path.is_absolute():
+        return path
+    declared = scenario.task.declared
+    return (models_dir() if declared is None else Path(declared.folder)) / path
 
 
 class Episode:
@@ -258,7 +261,7 @@ class Episode:
     ) -> None:
         began = wall.perf_counter()
         self.scenario, self.seed, self.split = scenario, seed, split
-        self.task: Task = make_task(scenario.task.name)
+        self.task: Task = scenario_task(scenario)
         chosen = scenario.aligner.name if aligner is None else aligner
         if chosen != EXPERT and demonstrations is None:
             folder = demonstrations_path(scenario)
