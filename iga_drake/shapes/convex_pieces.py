@@ -1,4 +1,4 @@
-"""Convex pieces whose union is about a mesh: what collides, since contact with a mesh takes its hull.
+"""Convex pieces whose union is about a mesh: contact with a mesh itself would take its hull.
 
 A connected part that is nearly convex is its own hull. The others are decomposed by CoACD (Wei et
 al. 2022, the package `coacd`), once: the pieces are kept in a file named after the mesh's content.
@@ -6,6 +6,7 @@ al. 2022, the package `coacd`), once: the pieces are kept in a file named after 
 
 import hashlib
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -61,8 +62,18 @@ def convex_pieces(mesh: trimesh.Trimesh, *, most: int = 24) -> tuple[np.ndarray,
             rest.append(part)
     if rest:
         left = max(most - len(convex), 1)
-        convex += _kept_decomposition(trimesh.util.concatenate(rest), left)
+        convex += _kept_decomposition(joined(rest), left)
     return tuple(convex)
+
+
+def joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Several meshes as one."""
+    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
+    return trimesh.Trimesh(
+        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
+        faces=np.concatenate([m.faces + start for m, start in zip(meshes, offsets, strict=True)]),
+        process=False,
+    )
 
 
 def hull_of(points: np.ndarray) -> trimesh.Trimesh:

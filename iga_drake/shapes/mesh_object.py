@@ -1,4 +1,4 @@
-"""Makes an object that can be simulated from a mesh file: scaled, stood up, with mass and pieces."""
+"""Makes an object that can be simulated from a mesh file: with mass and pieces that collide."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from iga_drake.shapes.convex_pieces import convex_pieces, hull_of
+from iga_drake.shapes.convex_pieces import convex_pieces, hull_of, joined
 from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.instance import MassProperties, ShapeInstance, frame
 from iga_drake.shapes.mesh_cleaning import MeshCleaning
@@ -93,7 +93,7 @@ def read_mesh_object(path: Path, reading: MeshReading | None = None) -> ShapeIns
 
 def solid_mass(pieces: tuple[np.ndarray, ...], density: float) -> MassProperties:
     """Mass properties of convex pieces (n, 3) (m) of one density (kg / m^3) together."""
-    hulls = trimesh.util.concatenate([hull_of(piece) for piece in pieces])
+    hulls = joined([hull_of(piece) for piece in pieces])
     return MassProperties(
         mass=float(hulls.volume) * density,
         p_OCcm=np.asarray(hulls.center_mass, dtype=np.float64),

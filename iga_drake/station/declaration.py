@@ -38,8 +38,8 @@ class FrameDeclaration:
 class PlaceDeclaration:
     """Where an object may stand at the start."""
 
-    # Corners of the rectangle that its origin is in: x and y in W (m), or in the frame of `on`.
-    # Empty: [0.4, -0.25] to [0.65, 0.25], or that frame's origin.
+    # Corners of the rectangle that its origin is in: x and y in W (m), or in the frame that it
+    # `stands_on`. Empty: [0.4, -0.25] to [0.65, 0.25], or that frame's origin.
     lower: list[float] = field(default_factory=list)
     upper: list[float] = field(default_factory=list)
     # Least and greatest distance (m) from W's z axis.
@@ -50,7 +50,7 @@ class PlaceDeclaration:
     rpy_deg: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     # Another object stated before, and one of its frames, "box.top": it stands there. Empty: on
     # the table.
-    on: str = ""
+    stands_on: str = ""
     # Least distance (m) from the other objects on the table.
     clearance: float = 0.02
 
@@ -251,11 +251,11 @@ class TaskDeclaration:
         digest of its content."""
         objects = {}
         for name, item in self.objects.items():
-            found = {
-                key: [f"{file} {self._digest(file)}".strip() for file in getattr(item, key)]
-                for key in ("files", "test_files")
-            }
-            objects[name] = dataclasses.replace(item, **found)
+            objects[name] = dataclasses.replace(
+                item,
+                files=[f"{file} {self._digest(file)}" for file in item.files],
+                test_files=[f"{file} {self._digest(file)}" for file in item.test_files],
+            )
         return dataclasses.replace(self, folder="", objects=objects)
 
     def _digest(self, file: str) -> str:

@@ -50,6 +50,7 @@ from iga_drake.tasks.task import Split, Task
 
 _GRIPPER = "gripper"
 _TEST = 1_000  # seeds of the instances of the test split begin here
+_REACH = HAND_OPENING_MAX / 2 + 0.005  # m from E, along the fingers' way, to what they close on
 # Where the hand shows what it has picked up, if nothing is stated: pointing down, in the middle.
 _PRESENT = RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.44, 0.0, 0.42])
 _PREDICATES: Mapping[str, type[WindowPredicate]] = {
@@ -177,7 +178,8 @@ class DeclaredTask(Task):
     # Scenes
 
     def arrange(self, truth: SceneTruth, rng: np.random.Generator, mesh_folder: Path) -> Scene:
-        loaded = self._load(self.seeds[truth.split][truth.instance])
+        split: Split = "test" if truth.split == "test" else "demonstration"
+        loaded = self._load(self.seeds[split][truth.instance])
         poses: dict[str, RigidTransform] = {}
         opening = HAND_OPENING_MAX
         if self._held is not None:
@@ -187,8 +189,8 @@ class DeclaredTask(Task):
             if name in poses:
                 continue
             shape = loaded[name].shape
-            if item.place.on:
-                poses[name] = self._on(name, item.place, shape, loaded, poses, rng)
+            if item.place.stands_on:
+                poses[name] = self._upon(name, item.place, shape, loaded, poses, rng)
                 continue
             try:
                 poses[name] = _stand(item.place, shape, footprints, rng)
@@ -240,7 +242,7 @@ class DeclaredTask(Task):
         where = f"task.declared.objects.{self._held}.held"
         try:
             X_OE, opening = centred_grip(
-                shape, _frame(shape, declared.frame, where) @ _pose(declared)
+                shape, _frame(shape, declared.frame, where) @ _pose(declared), reach=_REACH
             )
         except TaskError as error:
             raise TaskError(f"{where}: {error}: move E onto the object") from error
@@ -251,7 +253,7 @@ class DeclaredTask(Task):
             )
         return end_effector_pose(self.observe_posture) @ X_OE.inverse(), opening
 
-    def _on(
+    def _upon(
         self,
         name: str,
         place: PlaceDeclaration,
@@ -261,12 +263,12 @@ class DeclaredTask(Task):
         rng: np.random.Generator,
     ) -> RigidTransform:
         """X_WO of an object on a frame of another."""
-        where = f"task.declared.objects.{name}.place.on"
-        other, _, frame = place.on.partition(".")
+        where = f"task.declared.objects.{name}.place.stands_on"
+        other, _, frame = place.stands_on.partition(".")
         if other not in poses:
             raise TaskError(
-                f"{where}: '{place.on}' found, an object that is stated before and its frame, such "
-                "as box.top, expected"
+                f"{where}: '{place.stands_on}' found, an object that is stated before and its "
+                "frame, such as box.top, expected"
             )
         X_WF = poses[other] @ _frame(loaded[other].shape, frame, where)
         x, y = rng.uniform(place.lower, place.upper) if place.lower else (0.0, 0.0)

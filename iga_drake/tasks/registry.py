@@ -35,7 +35,7 @@ def scenario_task(scenario: Scenario) -> Task:
         return make_task(choice.name)
     if choice.name in task_names():
         raise TaskError(
-            f"task.name: '{choice.name}' is a task that there is already, and the scenario declares "
-            "one: give it another name"
+            f"task.name: '{choice.name}' is a task that there is already, and the scenario "
+            "declares one: give it another name"
         )
     return DeclaredTask(choice.name, choice.declared)

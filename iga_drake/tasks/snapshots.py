@@ -76,7 +76,7 @@ def read_snapshot(plant: MultibodyPlant, context: Context, panda: PandaModel) ->
         for index in plant.GetBodyIndices(instance):
             body_names[int(index)] = name
             body = plant.get_body(index)
-            if body.is_floating_base_body() or plant.IsAnchored(body) and name not in X_WO:
+            if body.is_floating_base_body() or (plant.IsAnchored(body) and name not in X_WO):
                 X_WO[name] = plant.EvalBodyPoseInWorld(context, body)
     for index in plant.GetBodyIndices(panda.instance):
         body_names[int(index)] = ROBOT

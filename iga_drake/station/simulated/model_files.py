@@ -39,7 +39,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from iga_drake.errors import error_text
 from iga_drake.files import write_text
 from iga_drake.paths import cache_dir
-from iga_drake.shapes.convex_pieces import hull_of
+from iga_drake.shapes.convex_pieces import hull_of, joined
 from iga_drake.shapes.instance import MassProperties, ShapeInstance
 from iga_drake.shapes.mesh_object import LARGEST, UP_AXES
 from iga_drake.shapes.sdf import visual_obj
@@ -370,6 +370,12 @@ def _copy_materials(path: Path, folder: Path) -> None:
 # The object in a plant
 
 
+def names_the_world(item: SceneObject) -> bool:
+    """Whether an object's model may fix something to the world: it has to be added to a plant that
+    has no constraints yet, so before the robot."""
+    return re.search(r"<static>\s*(true|1)|\bworld\b", item.model) is not None
+
+
 def add_object(plant: MultibodyPlant, item: SceneObject) -> AddedObject:
     """Adds an object's bodies; their model instances are called by its name, or NAME::....
 
@@ -464,7 +470,13 @@ def _placed(
             )
         welded = {int(weld.child_body().index()) for weld in welds}
         base = next(body for body in bodies if int(body.index()) in welded)
-        _move_welds(plant, welds, base, item.X_WO)
+        try:
+            _move_welds(plant, welds, base, item.X_WO)
+        except RuntimeError as error:  # of constraints in the plant
+            raise StationError(
+                f"{where}: it can't be fixed where it is to stand: {_reason(error)}; leave out "
+                "what constrains it (a mimic joint, say), or the joint to the world"
+            ) from error
     else:
         base = roots[0]
     for body in bodies:
@@ -526,7 +538,7 @@ def model_shape(model: str, name: str, source: str) -> tuple[ShapeInstance, bool
         )
     ]
     names = list(dict.fromkeys(label for label, _ in hulls))
-    surface = trimesh.util.concatenate([hull for _, hull in hulls])
+    surface = joined([hull for _, hull in hulls])
     labels = np.concatenate([np.full(len(hull.faces), names.index(n)) for n, hull in hulls])
     X_BW = added.base.EvalPoseInWorld(context).inverse()
     frames = {}

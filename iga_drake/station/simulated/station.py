@@ -20,7 +20,12 @@ from iga_drake.station.contract import CHEAT, StationError
 from iga_drake.station.panda.command import PandaCommand
 from iga_drake.station.panda.model import PandaModel, Visuals, add_panda
 from iga_drake.station.scenario import Scenario, Table
-from iga_drake.station.simulated.model_files import AddedObject, add_object, check_object
+from iga_drake.station.simulated.model_files import (
+    AddedObject,
+    add_object,
+    check_object,
+    names_the_world,
+)
 from iga_drake.station.simulated.scene import Scene
 from iga_drake.systems.ports import PANDA_JOINTS, Role
 from iga_drake.systems.segmentation import Segmentation
@@ -52,14 +57,16 @@ def build_simulation_station(
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(config=scenario.plant, builder=builder)
     plant.set_name("plant")
-    panda = add_panda(plant, controlled=True, visuals=cast(Visuals, scenario.panda.visuals))
-    _add_table(plant, scenario.table)
-    roles = {int(body): Role.ROBOT for body in plant.GetBodyIndices(panda.instance)}
-    added = {}
     for item in scene.objects:
         if item.role not in _ROLES:
             raise StationError(f"object '{item.name}': role '{item.role}', allowed: {[*_ROLES]}")
-        added[item.name] = add_object(plant, item)
+    first = [item for item in scene.objects if names_the_world(item)]
+    added = {item.name: add_object(plant, item) for item in first}
+    panda = add_panda(plant, controlled=True, visuals=cast(Visuals, scenario.panda.visuals))
+    _add_table(plant, scenario.table)
+    added |= {item.name: add_object(plant, item) for item in scene.objects if item not in first}
+    roles = {int(body): Role.ROBOT for body in plant.GetBodyIndices(panda.instance)}
+    for item in scene.objects:
         for body in added[item.name].bodies:
             roles[int(body.index())] = _ROLES[item.role]
     plant.Finalize()
