@@ -74,6 +74,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     trimesh.creation.box((60, 50, 30)).export(folder / "meshes" / "crate.obj")
     trimesh.creation.box((60, 70, 30)).export(folder / "meshes" / "tall.obj")
     (folder / "plinth.sdf").write_text(PLINTH)
+    (folder / "own_demonstrations").mkdir()
     (folder / "mine.yaml").write_text(FILE)
     return folder
 
