@@ -51,7 +51,7 @@ MODEL_FILES = {".sdf": "sdf", ".urdf": "urdf", ".dmd.yaml": "dmd.yaml"}
 _DRAWN = (".obj", ".gltf", ".vtk")
 _CONVERTED = (".stl", ".ply", ".glb", ".dae", ".off")
 _FIXED_LARGEST = 20.0  # m, of what is fixed to the world
-# Radius of gyration of the heaviest hollow body over half the diagonal of its bounds is 1.
+# What is hollow has at most half the diagonal of its bounds for a radius of gyration.
 _GYRATION = 2.0
 
 
@@ -373,7 +373,7 @@ def _copy_materials(path: Path, folder: Path) -> None:
 def names_the_world(item: SceneObject) -> bool:
     """Whether an object's model may fix something to the world: it has to be added to a plant that
     has no constraints yet, so before the robot."""
-    return re.search(r"<static>\s*(true|1)|\bworld\b", item.model) is not None
+    return re.search(r"<static>\s*(true|1)|\bworld\b|^directives:", item.model) is not None
 
 
 def add_object(plant: MultibodyPlant, item: SceneObject) -> AddedObject:
@@ -574,8 +574,8 @@ def check_object(
       inspector, context: of the finished plant; the context is the plant's own.
       source: names the object in messages.
 
-    Raises `StationError` where the object is larger than one on a table can be, or a free one's
-    inertia can't be that of something of its size.
+    Raises `StationError` where the object is larger than one on a table can be, or a free one
+    states no inertia.
     """
     points = np.concatenate(
         [points for _, points in _geometries(plant, inspector, context, added, source)]
@@ -596,14 +596,23 @@ def check_object(
         return MassProperties(1.0, np.zeros(3), np.eye(3))
     central = inertia.Shift(inertia.get_com()).CalcRotationalInertia().CopyToFullMatrix3()
     gyration = np.sqrt(np.linalg.eigvalsh(central)[-1] / kilograms)
-    if not added.fixed and gyration > _GYRATION * np.linalg.norm(size) / 2:
+    unstated = [body.name() for body in added.bodies if _has_default_inertia(body)]
+    if unstated and not added.fixed and gyration > _GYRATION * np.linalg.norm(size) / 2:
         raise StationError(
-            f"{source}: inertia of {kilograms:.3g} kg with a radius of gyration of {gyration:.3g} "
-            f"m in an object of {np.linalg.norm(size):.3g} m: a link without <inertial> is taken "
-            "for 1 kg and 1 kg m^2; state <inertial>, or name its mesh file as the object, with a "
-            "density or mass"
+            f"{source}: link '{unstated[0]}' states no mass and inertia, and 1 kg with a radius of "
+            f"gyration of 1 m, which Drake would take, can't be those of something "
+            f"{np.linalg.norm(size):.3g} m large: state <inertial>, or name its mesh file as the "
+            "object, with a density or mass"
         )
     return MassProperties(kilograms, np.asarray(inertia.get_com()), np.asarray(central))
+
+
+def _has_default_inertia(body: RigidBody) -> bool:
+    """Whether it has the mass and inertia of an SDF link that states none."""
+    if body.default_mass() != 1.0:
+        return False
+    moments = body.default_spatial_inertia().CalcRotationalInertia().get_moments()
+    return bool(np.allclose(moments, 1.0))
 
 
 def _geometries(

@@ -60,11 +60,13 @@ def build_simulation_station(
     for item in scene.objects:
         if item.role not in _ROLES:
             raise StationError(f"object '{item.name}': role '{item.role}', allowed: {[*_ROLES]}")
-    first = [item for item in scene.objects if names_the_world(item)]
-    added = {item.name: add_object(plant, item) for item in first}
+    first = {id(item) for item in scene.objects if names_the_world(item)}
+    added = {item.name: add_object(plant, item) for item in scene.objects if id(item) in first}
     panda = add_panda(plant, controlled=True, visuals=cast(Visuals, scenario.panda.visuals))
     _add_table(plant, scenario.table)
-    added |= {item.name: add_object(plant, item) for item in scene.objects if item not in first}
+    for item in scene.objects:
+        if id(item) not in first:
+            added[item.name] = add_object(plant, item)
     roles = {int(body): Role.ROBOT for body in plant.GetBodyIndices(panda.instance)}
     for item in scene.objects:
         for body in added[item.name].bodies:

@@ -224,7 +224,10 @@ REFUSED = {
     "package.sdf": (_sdf(_link(_mesh("package://nowhere/a.obj"))), "'nowhere' is unknown: state"),
     "scheme.sdf": (_sdf(_link(_mesh("http://a/b.obj"))), "'http' is no kind of URI.*use file"),
     "format.sdf": (_sdf(_link(_mesh("format.sdf"))), "'.sdf' can't be read; use one of .obj"),
-    "no_inertial.sdf": (_sdf(_link(_PLAIN, inertial="")), "radius of gyration.*state <inertial>"),
+    "no_inertial.sdf": (
+        _sdf(_link(_PLAIN, inertial="")),
+        "'cube' states no mass.*state <inertial>",
+    ),
     "massless.sdf": (_sdf(_link(_PLAIN).replace(f"<mass>{MASS}", "<mass>0")), "0 kg.*> 0"),
     "inertia.sdf": (_sdf(_link(_PLAIN, inertial=_BAD)), "principal moments.*compute them anew"),
     "loose.sdf": (_sdf(_link(_PLAIN, "a"), _link(_PLAIN, "b")), "'a', 'b' are not joined.*join"),
