@@ -23,7 +23,7 @@ from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, fo
 from iga_drake.files import process_lives
 from iga_drake.station.scenario import Scenario
 from iga_drake.tasks.episode import demonstrations_path
-from iga_drake.tasks.registry import make_task
+from iga_drake.tasks.registry import scenario_task
 
 BROKEN = "error"  # cause of a trial whose process broke
 
@@ -88,7 +88,7 @@ def trial_key(scenario: Scenario) -> dict[str, Any]:
         "scenario": scenario.digest,
         "demonstrations": folder_digest(demonstrations_path(scenario)),
         **aligner_key(aligner, name, options),
-        "code": code_key(aligner, make_task(scenario.task.name)),
+        "code": code_key(aligner, scenario_task(scenario)),
     }
 
 

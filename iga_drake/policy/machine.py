@@ -463,7 +463,8 @@ class PolicyMachine:
         least = config.minimum_familiarity
         if estimate.familiarity is not None:
             unknown = [
-                f"the {name} object looks like none of the demonstrations' (familiarity {value:.2f})"
+                f"the {name} object looks like none of the demonstrations' (familiarity "
+                f"{value:.2f})"
                 for name, value in zip(("grasped", "target"), estimate.familiarity, strict=True)
                 if not value >= least
             ]

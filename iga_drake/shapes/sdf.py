@@ -59,7 +59,7 @@ def write_sdf(
       soft: the convex pieces that are not rigid, by their index.
     """
     meshes = _write_meshes(instance, Path(folder))
-    return _sdf(instance, meshes.as_uri(), name=name, color=color, friction=friction, soft=soft)
+    return _sdf(instance, f"file://{meshes}", name=name, color=color, friction=friction, soft=soft)
 
 
 def write_sdf_file(
@@ -179,7 +179,7 @@ def _write_meshes(instance: ShapeInstance, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=folder))
     try:
-        (temporary / "visual.obj").write_text(_visual_obj(instance.mesh))
+        (temporary / "visual.obj").write_text(visual_obj(instance.mesh))
         for index, piece in enumerate(instance.convex_pieces):
             hull = trimesh.convex.convex_hull(piece)
             (temporary / f"piece_{index}.obj").write_text(_obj(hull.vertices, hull.faces))
@@ -201,7 +201,7 @@ def _digest(instance: ShapeInstance) -> str:
     return digest.hexdigest()[:16]
 
 
-def _visual_obj(mesh: trimesh.Trimesh) -> str:
+def visual_obj(mesh: trimesh.Trimesh) -> str:
     """An .obj whose normals are averaged over a vertex's faces that meet at less than a crease."""
     corner_normals = _corner_normals(mesh)
     keys, index = np.unique(np.round(corner_normals.reshape(-1, 3), 5), axis=0, return_inverse=True)

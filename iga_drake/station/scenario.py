@@ -27,6 +27,7 @@ from iga_drake.policy.machine import PolicyConfig
 from iga_drake.station.cameras.clutter import Clutter
 from iga_drake.station.cameras.kinds import camera_type
 from iga_drake.station.cameras.rgbd import LookAt, RgbdCamera
+from iga_drake.station.declaration import TaskDeclaration
 from iga_drake.systems.differential_ik import DifferentialIkConfig
 from iga_drake.systems.fusion import FusionConfig
 from iga_drake.systems.geometric_segmentation import SegmentationConfig
@@ -104,10 +105,12 @@ def _cameras() -> dict[str, RgbdCamera]:
 class TaskChoice:
     """The task to do, by name, and its time limit."""
 
-    # Name in the task registry of `iga_drake.tasks`.
+    # Name in the task registry of `iga_drake.tasks`, or, with `declared`, a new one.
     name: str = "grasp"
     # Simulated time after which the episode has failed (s), > 0.
     time_limit: float = 120.0
+    # The task itself, where no registered one is meant.
+    declared: TaskDeclaration | None = None
 
 
 @dataclass
@@ -177,8 +180,12 @@ class Scenario:
 
     @property
     def digest(self) -> str:
-        """First 16 hexadecimal digits of the SHA-256 of `to_yaml()`; files' places don't matter."""
+        """First 16 hexadecimal digits of the SHA-256 of `to_yaml()`; files' places don't matter
+        and the content of the objects' files does."""
         said = dataclasses.replace(self, demonstrations=Path(self.demonstrations).name)
+        if self.task.declared is not None:
+            declared = self.task.declared.portable()
+            said = dataclasses.replace(said, task=dataclasses.replace(self.task, declared=declared))
         return hashlib.sha256(said.to_yaml().encode()).hexdigest()[:16]
 
     def to_yaml(self) -> str:
@@ -225,6 +232,9 @@ def load_scenario(
                 f"{file}: {size} bytes, a scenario has at most {_LARGEST_FILE}: is it another file?"
             )
         scenario = _layered(scenario, text, str(file))
+        declared = scenario.task.declared
+        if declared is not None and not Path(declared.folder).is_absolute():
+            declared.folder = str((file.resolve().parent / declared.folder).resolve())
         if _states(text, "demonstrations"):
             beside = _beside(file, scenario.demonstrations)
             scenario = dataclasses.replace(scenario, demonstrations=beside)
@@ -468,5 +478,7 @@ def _check_values(s: Scenario) -> None:
     s.policy.check("policy")
     s.visualization.check("visualization")
     check_bounds(s.task, "task", {"time_limit": (1e-3, 86_400.0)})
+    if s.task.declared is not None:
+        s.task.declared.check("task.declared")
     check_range(1 <= s.context_size <= 1000, "context_size", s.context_size, "1 to 1000")
     check_bounds(s.seeds, "seeds", dict.fromkeys(vars(s.seeds), (0, _MOST_SEED)))

@@ -41,7 +41,7 @@ from iga_drake.systems.messages import Cause
 from iga_drake.tasks.distractors import with_distractors
 from iga_drake.tasks.oracle import OracleInference
 from iga_drake.tasks.pose_error import pose_error_at
-from iga_drake.tasks.registry import make_task
+from iga_drake.tasks.registry import scenario_task
 from iga_drake.tasks.robot_diagram import RobotDiagram, build_robot_diagram
 from iga_drake.tasks.snapshots import Snapshot, TaskError, read_snapshot
 from iga_drake.tasks.task import Split, Task
@@ -261,7 +261,7 @@ class Episode:
     ) -> None:
         began = wall.perf_counter()
         self.scenario, self.seed, self.split = scenario, seed, split
-        self.task: Task = make_task(scenario.task.name)
+        self.task: Task = scenario_task(scenario)
         chosen = scenario.aligner.name if aligner is None else aligner
         if chosen not in PRIVILEGED and demonstrations is None:
             folder = demonstrations_path(scenario)

@@ -270,7 +270,8 @@ def test_poses_that_are_not_finite_are_refused():
 def test_objects_that_look_like_none_of_the_demonstrations_are_refused_where_asked():
     for familiarity, least, refused in (
         ((0.9, 0.2), 0.0, ""), ((0.9, 0.2), 0.5, "the target object looks like none"),
-        ((0.2, 0.9), 0.5, "the grasped object looks like none"), ((0.5, 0.5), 0.5, ""), (None, 0.5, ""),
+        ((0.2, 0.9), 0.5, "the grasped object looks like none"), ((0.5, 0.5), 0.5, ""),
+        (None, 0.5, ""),
     ):  # fmt: skip
         aligner = FakeAligner(familiarity=familiarity)
         machine = make_machine(aligner=aligner, minimum_familiarity=least)
