@@ -71,7 +71,9 @@ def with_aligner(scenario: "Scenario", name: str, options: Mapping[str, Any]) ->
         if isinstance(value, bool) or not isinstance(value, (int, float, str)):
             raise CommandError(f"--option {option}={value}: a number or text is expected")
     own = scenario.aligner.options if name == scenario.aligner.name else {}
-    if name not in PRIVILEGED:  # whether it takes them and all it needs is there, before the simulation
+    if (
+        name not in PRIVILEGED
+    ):  # whether it takes them and all it needs is there, before the simulation
         make_aligner(name, **{**own, **options})
     chosen = dataclasses.replace(scenario.aligner, name=name, options={**own, **options})
     return dataclasses.replace(scenario, aligner=chosen)

@@ -91,9 +91,7 @@ def test_an_energy_of_nan_makes_no_aligner(tmp_path: Path) -> None:
     path = tmp_path / "energy.safetensors"
     card = {"model": dataclasses.asdict(net.config)}
     save_checkpoint(path, net.state_dict(), kind=ENERGY, card=card)
-    with pytest.raises(
-        CheckpointError, match="'log_temperature' holds numbers that are not"
-    ):
+    with pytest.raises(CheckpointError, match="'log_temperature' holds numbers that are not"):
         make_aligner("iga-energy", energy=str(path))
 
 
