@@ -64,8 +64,9 @@ def grip(shape: ShapeInstance, *, depth: float, roll: float) -> tuple[RigidTrans
     return centred_grip(shape, X_OE)
 
 
-def _pair(seed: int) -> Mapping[str, ShapeInstance]:
-    """Draws bowls until one can be put into the other by a hand that holds its rim."""
+def nesting_bowls(seed: int, *, depth: float) -> Mapping[str, ShapeInstance]:
+    """Draws bowls until `HELD` can be put into `TARGET` by a hand that holds its rim: E is `depth`
+    (m) from the rim along the wall."""
     rng = np.random.default_rng(seed)
     for _ in range(TRIES):
         target = bowl.sample_parameters(rng)
@@ -75,7 +76,7 @@ def _pair(seed: int) -> Mapping[str, ShapeInstance]:
         if held["lean"] > 0.4:
             continue  # the hand would lean too far
         shapes = {TARGET: bowl.build(target), HELD: bowl.build(held)}
-        X_OE, _ = grip(shapes[HELD], depth=_GRIP_DEPTH[1], roll=0.0)
+        X_OE, _ = grip(shapes[HELD], depth=depth, roll=0.0)
         profiles = bowl.profile(held), bowl.profile(target)
         nested = nesting_height(*profiles)
         release = release_height(*profiles, X_OE, (0.005, RELEASE_OPENING))
@@ -126,7 +127,7 @@ class Stack(Task):
 
     @staticmethod
     def make_shapes(seed: int) -> Mapping[str, ShapeInstance]:
-        return _pair(seed)
+        return nesting_bowls(seed, depth=_GRIP_DEPTH[1])
 
     def arrange(self, truth: SceneTruth, rng: np.random.Generator, mesh_folder: Path) -> Scene:
         shapes = truth.shapes
