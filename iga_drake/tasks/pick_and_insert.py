@@ -38,8 +38,8 @@ class PickAndInsert(Task):
 
     name = "pick_and_insert"
     seeds: ClassVar[Mapping[Split, tuple[int, ...]]] = {
-        "demonstration": tuple(range(1101, 1109)),
-        "test": tuple(range(1201, 1216)),
+        "demonstration": tuple(range(1101, 1107)),
+        "test": tuple(range(1201, 1211)),
     }
     observe_posture = _INSERT.observe_posture
     motion = TaskMotion(
