@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
 from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
-from iga_drake.policy.motion import ObservationPlan, TaskMotion, WaypointMotion
+from iga_drake.policy.motion import ObservationPlan, TaskMotion
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
+from iga_drake.tasks.grasp import Grasp
 from iga_drake.tasks.holding import wrist_turn
 from iga_drake.tasks.insert import HELD, TARGET, Insert, cap_grip
 from iga_drake.tasks.placement import WorkArea
@@ -28,6 +29,7 @@ _BOTTLE_AREA = WorkArea(lower=(0.35, -0.35), upper=(0.66, 0.35), reach=(0.40, 0.
 _FRICTION = (0.5, 0.8)
 _COLORS = ((0.2, 0.45, 0.3), (0.25, 0.4, 0.62), (0.7, 0.35, 0.15), (0.5, 0.5, 0.52))
 _LEATHERS = ((0.36, 0.22, 0.14), (0.16, 0.16, 0.17), (0.72, 0.7, 0.66), (0.45, 0.18, 0.16))
+(_GRASP,) = Grasp.motion.waypoints
 _INSERT = Insert()
 (_HELD_PLAN,) = (plan for plan in _INSERT.motion.observations if plan.role == "grasped")
 
@@ -50,20 +52,12 @@ class PickAndInsert(Task):
             ObservationPlan(name="shoe", role="target", frame="W", upright=True, after=1),
         ),
         waypoints=(
-            WaypointMotion(
+            replace(
+                _GRASP,
                 name="pick",
-                grasped="gripper",
                 target="bottle",
-                before_W=(0.0, 0.0, 0.08),
-                opening_approach=HAND_OPENING_MAX,
-                opening_reached=0.0,
-                settle=1.0,
                 contact_force=CONTACT_FORCE,
                 after_W=(0.0, 0.0, LIFT),
-                symmetries_E=(
-                    RigidTransform(),
-                    RigidTransform(RotationMatrix.MakeZRotation(np.pi), [0, 0, 0]),
-                ),
             ),
             *(
                 replace(waypoint, grasped="bottle in the hand")
@@ -119,7 +113,7 @@ class PickAndInsert(Task):
         from where the bottle is in the hand."""
         X_OE, _ = cap_grip(scene.truth.shapes[HELD], depth=_GRIP_DEPTH, yaw=0.0)
         pick = min(
-            (X_WO[HELD] @ X_OE @ X_EE for X_EE in self.motion.waypoints[0].symmetries_E),
+            (X_WO[HELD] @ X_OE @ X_EE for X_EE in _GRASP.symmetries_E),
             key=lambda pose: abs(wrist_turn(pose)),
         )
         return (pick, *_INSERT.expert(scene, X_WO, X_WE))

@@ -9,11 +9,12 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
 from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
-from iga_drake.policy.motion import ObservationPlan, TaskMotion, WaypointMotion
+from iga_drake.policy.motion import ObservationPlan, TaskMotion
 from iga_drake.shapes.families import bowl
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
+from iga_drake.tasks.grasp import Grasp
 from iga_drake.tasks.placement import WorkArea
 from iga_drake.tasks.predicates import AllOf, CarriedStill, Predicate
 from iga_drake.tasks.stack import HELD, TARGET, WORK_AREA, Stack, grip, nesting_bowls
@@ -27,6 +28,7 @@ _ASIDE = 0.12  # m, least distance of the lower bowl from the robot's plane of s
 _HAND = 0.12  # m between the two rims: half the hand goes down there
 _UPPER_AREA = WorkArea(lower=(0.42, -0.3), upper=(0.65, 0.3), reach=(0.48, 0.66))
 _COLORS = ((0.85, 0.83, 0.76), (0.2, 0.42, 0.6), (0.72, 0.35, 0.24), (0.35, 0.55, 0.4))
+(_GRASP,) = Grasp.motion.waypoints
 _STACK = Stack()
 (_PUT,) = _STACK.motion.waypoints
 (_HELD_PLAN,) = (plan for plan in _STACK.motion.observations if plan.role == "grasped")
@@ -50,20 +52,12 @@ class PickAndStack(Task):
             ObservationPlan(name="lower bowl", role="target", frame="W", upright=True, after=1),
         ),
         waypoints=(
-            WaypointMotion(
+            replace(
+                _GRASP,
                 name="pick",
-                grasped="gripper",
                 target="upper bowl",
-                before_E=(0.0, 0.0, -0.08),
-                opening_approach=HAND_OPENING_MAX,
-                opening_reached=0.0,
-                settle=1.0,
                 contact_force=CONTACT_FORCE,
                 after_W=(0.0, 0.0, LIFT),
-                symmetries_E=(
-                    RigidTransform(),
-                    RigidTransform(RotationMatrix.MakeZRotation(np.pi), [0, 0, 0]),
-                ),
             ),
             replace(_PUT, grasped="upper bowl in the hand", target="lower bowl"),
         ),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from demonstration_fakes import NAMES, make_demonstration, make_set
 from safetensors.numpy import load_file, save_file
+from scipy.spatial import cKDTree
 
 from iga_drake.demonstrations.demonstration import (
     DemonstrationError,
@@ -100,6 +101,22 @@ def test_landed_demonstrations_are_upright_as_their_task_says(task: str):
     for alignment in read.context(0):
         np.testing.assert_array_equal(alignment.target_up, [0, 0, 1])
         assert alignment.grasped_up is None
+
+
+@pytest.mark.parametrize("task", ["pick_and_stack", "pick_and_insert"])
+def test_landed_demonstrations_see_the_same_object_before_and_after_it_is_taken(task: str):
+    """What stood on the table is in the hand where the hand closed on it."""
+    read = read_demonstrations(models_dir() / "demonstrations" / task, task=task)
+    assert len(read) == 4
+    for demonstration in read.demonstrations:
+        assert demonstration.relations == make_task(task).motion.relations
+        pick, place = demonstration.waypoints[:2]
+        stood, held = (demonstration.observations[n] for n in (pick.target, place.grasped))
+        assert (stood.role, stood.frame, held.role, held.frame) == ("grasped", "W", "grasped", "E")
+        assert stood.time < held.time and pick.opening < 0.01
+        X_EW = np.linalg.inv(pick.X_WE)
+        there = stood.points @ X_EW[:3, :3].T + X_EW[:3, 3]
+        assert np.median(cKDTree(there).query(held.points)[0]) < 0.006
 
 
 def test_a_trajectory_may_be_missing(tmp_path: Path):

@@ -211,8 +211,9 @@ def test_carrying_is_the_time_in_the_hand_alone() -> None:
     assert not _holds(still, slipping(1.0, ("marble", TABLE)))
     assert _holds(still, slipping(1.0, ("box", TABLE)))
     # What was taken from the table at 1 s and meets the marble at 2 s was carried in between.
+    others = [TABLE, ROBOT, "marble"]
     taken = _snapshots(
-        contacts=lambda t: [{("box", TABLE)}, {("box", ROBOT)}, {("box", "marble")}][min(int(t), 2)],
+        contacts=lambda t: {("box", others[min(int(t), 2)])},
         box=lambda t: _pose([0, 0, 0.01 * t]) @ START["box"],
     )
     assert _judged(still, taken, "carrying_slip") == pytest.approx(0.0095)
