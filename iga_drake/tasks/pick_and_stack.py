@@ -26,7 +26,7 @@ CONTACT_FORCE = 15.0  # N; the hand closes where a finger meets the bowl
 _GRIP_DEPTH = 0.010  # m from the rim to the middle of the pads: as much above it as below is left
 _ASIDE = 0.12  # m, least distance of the lower bowl from the robot's plane of symmetry
 _HAND = 0.12  # m between the two rims: half the hand goes down there
-_UPPER_AREA = WorkArea(lower=(0.42, -0.3), upper=(0.65, 0.3), reach=(0.48, 0.66))
+_UPPER_AREA = WorkArea(lower=(0.42, -0.3), upper=(0.65, 0.3), reach=(0.55, 0.68))
 _COLORS = ((0.85, 0.83, 0.76), (0.2, 0.42, 0.6), (0.72, 0.35, 0.24), (0.35, 0.55, 0.4))
 (_GRASP,) = Grasp.motion.waypoints
 _STACK = Stack()
