@@ -107,7 +107,7 @@ def test_landed_demonstrations_are_upright_as_their_task_says(task: str):
 def test_landed_demonstrations_see_the_same_object_before_and_after_it_is_taken(task: str):
     """What stood on the table is in the hand where the hand closed on it."""
     read = read_demonstrations(models_dir() / "demonstrations" / task, task=task)
-    assert len(read) == 4
+    assert len(read) == 3
     for demonstration in read.demonstrations:
         assert demonstration.relations == make_task(task).motion.relations
         pick, place = demonstration.waypoints[:2]
