@@ -191,6 +191,26 @@ def test_foreign_manifests_are_refused(folder: Path, changes: dict, message: str
         read_demonstrations(folder)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"grasped": "thing"}, "'thing' is in frame W, E expected: relate .* in the hand"),
+        ({"target": "gripper"}, "'gripper' is in frame E, W expected: relate .* where it stood"),
+        (
+            {"grasped": "it"},
+            r"relates the grasped observation 'it', the demonstration has \['goal'",
+        ),
+    ],
+)
+def test_stages_that_relate_the_wrong_clouds_are_refused(folder: Path, change: dict, message: str):
+    """The second of two stages: the thing as it stood on the table, say, not as it was held."""
+    manifest = json.loads((folder / MANIFEST).read_text())
+    manifest["demonstrations"][1]["waypoints"][1] |= change
+    edit_manifest(folder, demonstrations=manifest["demonstrations"])
+    with pytest.raises(DemonstrationError, match=f"demonstration_1.*waypoint 'place': .*{message}"):
+        read_demonstrations(folder)
+
+
 @pytest.mark.parametrize("entry", [{}, 3, {"shape": [1, 3]}, {"shape": [1], "dtype": "tea"}])
 def test_an_array_without_shape_or_dtype_is_refused(folder: Path, entry):
     manifest = json.loads((folder / MANIFEST).read_text())
