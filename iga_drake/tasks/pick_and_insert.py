@@ -79,25 +79,16 @@ class PickAndInsert(Task):
         def free(X_WO: RigidTransform) -> bool:
             return bool(np.linalg.norm(shoe - X_WO.translation()[:2], axis=1).min() >= _ROOM)
 
-        poses = {TARGET: X_WT, HELD: _BOTTLE_AREA.draw_pose(rng, serves=free)}
-        colors = {
-            TARGET: _LEATHERS[rng.integers(len(_LEATHERS))],
-            HELD: _COLORS[rng.integers(len(_COLORS))],
-        }
-        objects = tuple(
-            SceneObject(
-                name,
-                role,
-                write_sdf(
-                    shapes[name],
-                    mesh_folder,
-                    name=name,
-                    color=colors[name],
-                    friction=rng.uniform(*_FRICTION),
-                ),
-                poses[name],
-            )
-            for name, role in ((TARGET, "target"), (HELD, "grasped"))
+        X_WO_held = _BOTTLE_AREA.draw_pose(rng, serves=free)
+        leather, color = (rgbs[rng.integers(len(rgbs))] for rgbs in (_LEATHERS, _COLORS))
+
+        def sdf(name: str, rgb: tuple[float, float, float]) -> str:
+            friction = rng.uniform(*_FRICTION)
+            return write_sdf(shapes[name], mesh_folder, name=name, color=rgb, friction=friction)
+
+        objects = (
+            SceneObject(TARGET, "target", sdf(TARGET, leather), X_WT),
+            SceneObject(HELD, "grasped", sdf(HELD, color), X_WO_held),
         )
         return Scene(
             objects=objects,

@@ -80,15 +80,15 @@ class PickAndStack(Task):
             distance = np.linalg.norm(X_WO.translation() - X_WT.translation())
             return bool(distance >= radii + _HAND)
 
-        poses = {TARGET: X_WT, HELD: _UPPER_AREA.draw_pose(rng, serves=free)}
-        objects = tuple(
-            SceneObject(
-                name,
-                role,
-                write_sdf(shapes[name], mesh_folder, name=name, color=_COLORS[k], friction=0.7),
-                poses[name],
-            )
-            for name, role, k in ((TARGET, "target", colors[0]), (HELD, "grasped", colors[1]))
+        X_WO_held = _UPPER_AREA.draw_pose(rng, serves=free)
+
+        def sdf(name: str, color: int) -> str:
+            rgb = _COLORS[colors[color]]
+            return write_sdf(shapes[name], mesh_folder, name=name, color=rgb, friction=0.7)
+
+        objects = (
+            SceneObject(TARGET, "target", sdf(TARGET, 0), X_WT),
+            SceneObject(HELD, "grasped", sdf(HELD, 1), X_WO_held),
         )
         return Scene(
             objects=objects,
