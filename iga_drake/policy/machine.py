@@ -475,10 +475,12 @@ class PolicyMachine:
                     "with such objects, or ask for less (policy.minimum_familiarity)",
                     Cause.ALIGNMENT,
                 )
+        # The arm comes from the waypoint before, unless it is there already or was elsewhere since.
+        moved = len(memory.chosen) == memory.followed
         chosen = choose_reachable(
             estimate,
             self.motion.waypoints[index],
-            near=memory.chosen[-1].posture if memory.chosen else inputs.position(),
+            near=inputs.position() if moved else memory.chosen[-1].posture,
             solve=self._solve,
             workspace=self._workspace,
             limit=config.infer_limit - seconds,

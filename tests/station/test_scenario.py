@@ -17,9 +17,12 @@ from iga_drake.station.scenario import (
     load_scenario,
 )
 
-SHIPPED = ("grasp", "stack", "hang", "insert", "pour", "sweep", "field", "one_of_everything")
+SHIPPED = (
+    "grasp", "stack", "hang", "insert", "pour", "sweep", "pick_and_stack", "pick_and_insert",
+    "field", "one_of_everything",
+)  # fmt: skip
 # Time steps (s) other than the default.
-TIME_STEPS = {"pour": 0.0025, "sweep": 0.005}
+TIME_STEPS = {"pour": 0.0025, "sweep": 0.005, "pick_and_stack": 0.004, "pick_and_insert": 0.004}
 
 
 def _load(tmp_path, text: str) -> Scenario:
