@@ -425,9 +425,8 @@ def _check_values(s: Scenario) -> None:
     check_range(good, "model_drivers", list(s.model_drivers), "one driver, that of 'panda'")
     for name, driver in s.model_drivers.items():
         driver.check(f"model_drivers.{name}")
-        good = driver.lcm_bus in s.lcm_buses
-        buses = ", ".join(s.lcm_buses)
-        check_range(good, f"model_drivers.{name}.lcm_bus", driver.lcm_bus, f"one of: {buses}")
+        _check_bus(s, f"model_drivers.{name}.lcm_bus", driver.lcm_bus)
+    _check_bus(s, "hardware.camera_bus", s.hardware.camera_bus)
     s.hardware.check("hardware")
     check_range(0 < len(s.cameras) <= 32, "cameras", list(s.cameras), "1 to 32 cameras")
     for name in s.cameras:
@@ -446,3 +445,7 @@ def _check_values(s: Scenario) -> None:
     check_bounds(s.task, "task", {"time_limit": (1e-3, 86_400.0)})
     check_range(1 <= s.context_size <= 1000, "context_size", s.context_size, "1 to 1000")
     check_bounds(s.seeds, "seeds", dict.fromkeys(vars(s.seeds), (0, _MOST_SEED)))
+
+
+def _check_bus(s: Scenario, key: str, name: str) -> None:
+    check_range(name in s.lcm_buses, key, name, f"one of: {', '.join(s.lcm_buses)}")

@@ -63,10 +63,13 @@ def read_calibration(
             f"{path}: can't be read ({error_text(error)}): {remedy}"
         ) from error
     try:
+        data = yaml.safe_load(text)
+        if isinstance(data.get("date"), datetime.datetime):  # it needs no quotes
+            text = yaml.safe_dump(data | {"date": data["date"].isoformat()})
         found = yaml_load_typed(schema=CameraCalibration, data=text)
         date = datetime.datetime.fromisoformat(str(found.date))
         values = np.array([*found.pose.translation, *found.pose.rpy], dtype=float)
-    except (RuntimeError, ValueError, TypeError, KeyError, yaml.YAMLError) as error:
+    except (RuntimeError, ValueError, TypeError, AttributeError, yaml.YAMLError) as error:
         raise CalibrationFileError(
             f"{path}: no calibration ({error_text(error)}): {remedy}"
         ) from error

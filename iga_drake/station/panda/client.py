@@ -87,8 +87,8 @@ class PandaClient(LeafSystem):
         - clock_offset
 
     - `status` (lcmt_panda_status), `hand_status` (lcmt_schunk_wsg_status): what was received.
-      Messages that are older than one that came before, that lack joints, or hold values that
-      aren't finite are left out; what was measured last then grows old.
+      Messages that are older than one that came before, that lack joints, whose joints are all 0,
+      or that hold values that aren't finite are left out; what was measured last then grows old.
     - `clock_offset` (1, s): this machine's clock minus the diagram's, fixed at the first update.
     - The others are the port contract's.
 
@@ -185,6 +185,8 @@ class PandaClient(LeafSystem):
             status.joint_position, status.joint_velocity, status.joint_torque_external,
         ]  # fmt: skip
         if any(len(row) != PANDA_JOINTS or not np.isfinite(row).all() for row in rows):
+            return link
+        if not np.any(status.joint_position):
             return link
         desired = np.array(status.joint_position_desired)
         strikes = 0

@@ -13,10 +13,11 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from robot_stub import HOME, START, make_scenario, stub_station
 
-from iga_drake.station.cameras.rgbd import Pose, true_pose
+from iga_drake.station.cameras.rgbd import Intrinsics, Pose, true_pose
 from iga_drake.station.hardware.calibration import CameraCalibration, write_calibration
 from iga_drake.station.hardware.images import ImageSender
 from iga_drake.station.hardware.station import build_hardware_station
+from iga_drake.station.lcm import Clock
 from iga_drake.station.panda.client import PandaStart
 from iga_drake.station.panda.driver import connect_server
 from iga_drake.station.panda.messages import STATUS_CHANNEL
@@ -31,9 +32,12 @@ def clock(context: Context) -> float:
     return EPOCH + context.get_time()
 
 
-def hardware_scenario(folder: Path) -> Scenario:
-    """The stub's cameras, calibrated now, on an in-process bus."""
+def hardware_scenario(folder: Path, *, small: bool = True) -> Scenario:
+    """The stub's cameras, calibrated now, on an in-process bus; `small` images are quick."""
     scenario = make_scenario()
+    if small:
+        for camera in scenario.cameras.values():
+            camera.intrinsics = Intrinsics(32, 24, fx=31.0, fy=31.0, cx=15.5, cy=11.5)
     scenario.station = "hardware"
     scenario.lcm_buses = {"default": DrakeLcmParams(lcm_url="memq://")}
     scenario.hardware.calibration = str(folder)
@@ -76,13 +80,13 @@ class BadLinkSender(ImageSender):
 
 
 def add_arm(
-    builder: DiagramBuilder, scenario: Scenario, lcm: DrakeLcm, *, camera_period: float = 0.1
+    builder: DiagramBuilder, scenario: Scenario, lcm: DrakeLcm, *, now: Clock = clock
 ) -> tuple[Any, BadLinkServer, dict[str, BadLinkSender]]:
     """Adds the stub's arm and cameras behind `lcm`: the stub, its server and its
     cameras' senders."""
     arm = builder.AddNamedSystem("arm", stub_station(scenario))
     driver = scenario.model_drivers["panda"]
-    server = BadLinkServer(lcm, control_mode=driver.control_mode, clock=clock)
+    server = BadLinkServer(lcm, control_mode=driver.control_mode, clock=now)
     add_panda_server(builder, server, lcm)
     names = [arm.get_input_port(i).get_name() for i in range(arm.num_input_ports())]
     ports = {name: arm.GetInputPort(name) for name in names}
@@ -93,7 +97,7 @@ def add_arm(
     connect_server(builder, server, ports)
     senders = {}
     for name, camera in scenario.cameras.items():
-        sender = BadLinkSender(name, camera.intrinsics, lcm, period=camera_period, clock=clock)
+        sender = BadLinkSender(name, camera.intrinsics, lcm, period=0.1, clock=now)
         senders[name] = builder.AddSystem(sender)
         for i in range(sender.num_input_ports()):
             port = sender.get_input_port(i)
@@ -103,16 +107,17 @@ def add_arm(
 
 class Motion(LeafSystem):
     """Commands (7, rad) that rise from rest to 0.3 rad/s at the last joint; `jump` (rad) may be set
-    at any time and is added to all."""
+    at any time and is added to all; `still` commands never change."""
 
     jump: Any = 0.0
+    still = False
 
     def __init__(self) -> None:
         super().__init__()
         self.DeclareVectorOutputPort("position", 7, self._calc)
 
     def _calc(self, context: Context, output: Any) -> None:
-        t = context.get_time()
+        t = 0.0 if self.still else context.get_time()
         angle = 0.3 * (t - 0.1 * np.tanh(t / 0.1))
         output.SetFromVector(START + np.array([0, 0, 0, 0, 0, 0, angle]) + self.jump)
 
@@ -120,14 +125,18 @@ class Motion(LeafSystem):
 class Rig:
     """A moving arm behind LCM: commands -> supervisor -> hardware station -> LCM -> arm."""
 
-    def __init__(self, scenario: Scenario, **options: Any) -> None:
+    def __init__(self, scenario: Scenario) -> None:
         self.late = 0.0  # s, by which the diagram lags behind the clock
         self.lcm = DrakeLcm("memq://")
+
+        def now(context: Context) -> float:
+            return clock(context) + self.late
+
         builder = DiagramBuilder()
         self.station = build_hardware_station(
             scenario,
             start=PandaStart(START, 0.04),
-            clock=lambda context: clock(context) + self.late,
+            clock=now,
             lcms={"default": self.lcm},
         )
         builder.AddSystem(self.station)
@@ -140,7 +149,7 @@ class Rig:
                 cameras=scenario.camera_names,
             )
         )
-        self.arm, self.server, self.senders = add_arm(builder, scenario, self.lcm, **options)
+        self.arm, self.server, self.senders = add_arm(builder, scenario, self.lcm, now=now)
         source = self.station.GetOutputPort
         for port, name in (
             ("position_measured", "panda.position_measured"),
@@ -165,7 +174,7 @@ class Rig:
         self.restart()
 
     def restart(self) -> None:
-        self.late, self.motion.jump = 0.0, 0.0
+        self.late, self.motion.jump, self.motion.still = 0.0, 0.0, False
         self.server.link = self.server.hand_link = self.server.robot_mode = None
         for sender in self.senders.values():
             sender.silent = False
