@@ -8,10 +8,12 @@ from drake import lcmt_image_array
 from pydrake.common.value import Value
 from pydrake.geometry import Meshcat
 from pydrake.lcm import DrakeLcm
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.lcm import LcmBuses, LcmInterfaceSystem
 from pydrake.systems.primitives import ConstantValueSource
 
+from iga_drake.station.cameras.rgbd import Intrinsics
 from iga_drake.station.contract import StationError
 from iga_drake.station.hardware.boot import boot_panda
 from iga_drake.station.hardware.calibration import read_calibration
@@ -44,6 +46,7 @@ def build_hardware_station(
     start: PandaStart,
     clock: Clock = wall_clock,
     lcms: Mapping[str, DrakeLcm] | None = None,
+    poses: Mapping[str, RigidTransform] | None = None,
 ) -> Diagram:
     """Builds the diagram "station", which exports `station_ports(scenario.camera_names)`.
 
@@ -54,10 +57,12 @@ def build_hardware_station(
       clock: this machine's.
       lcms: the scenario's buses by name, where others in this process use them as well; the
         station pumps them. By default it opens them itself.
+      poses: X_WC of each camera's optical frame; by default from the calibration files.
 
     Raises `StationError` for a bus that is none, `CalibrationFileError` for a camera's calibration.
     """
-    _check_buses(scenario)
+    if lcms is None:
+        _check_buses(scenario)
     builder = DiagramBuilder()
     driver = scenario.model_drivers["panda"]
     used = sorted({driver.lcm_bus, scenario.hardware.camera_bus})
@@ -74,28 +79,38 @@ def build_hardware_station(
         port = client.get_output_port(i)
         if port.get_name() != "clock_offset":
             builder.ExportOutput(port, port.get_name())
-    for name in scenario.camera_names:
-        _add_camera(builder, scenario, name, client, lcms[scenario.hardware.camera_bus])
+    poses = poses or {name: _calibrated(scenario, name) for name in scenario.cameras}
+    lcm = lcms[scenario.hardware.camera_bus]
+    for name, X_WC in poses.items():
+        _add_camera(builder, name, scenario.cameras[name].intrinsics, X_WC, client, lcm)
     station = builder.Build()
     station.set_name("station")
     return station
 
 
+def _calibrated(scenario: Scenario, name: str) -> RigidTransform:
+    calibration = read_calibration(
+        Path(scenario.hardware.calibration) / f"{name}.yaml",
+        intrinsics=scenario.cameras[name].intrinsics,
+        age=scenario.hardware.calibration_age,
+    )
+    return calibration.X_WC
+
+
 def _add_camera(
-    builder: DiagramBuilder, scenario: Scenario, name: str, client: PandaClient, lcm: DrakeLcm
+    builder: DiagramBuilder,
+    name: str,
+    intrinsics: Intrinsics,
+    X_WC: RigidTransform,
+    client: PandaClient,
+    lcm: DrakeLcm,
 ) -> None:
     """Exports one camera's ports. Labels are those in its messages."""
-    hardware, intrinsics = scenario.hardware, scenario.cameras[name].intrinsics
-    calibration = read_calibration(
-        Path(hardware.calibration) / f"{name}.yaml",
-        intrinsics=intrinsics,
-        age=hardware.calibration_age,
-    )
     receiver = builder.AddSystem(ImageReceiver(name, intrinsics))
     into = receiver.GetInputPort("images")
     add_subscriber(builder, f"{CHANNEL}{name}", lcmt_image_array, lcm, into)
     builder.Connect(client.GetOutputPort("clock_offset"), receiver.GetInputPort("clock_offset"))
-    pose = builder.AddNamedSystem(f"{name}.pose", ConstantValueSource(Value(calibration.X_WC)))
+    pose = builder.AddNamedSystem(f"{name}.pose", ConstantValueSource(Value(X_WC)))
     for port in camera_ports(name):
         short = port.name.removeprefix(f"{name}.")
         output = pose.get_output_port() if short == "pose" else receiver.GetOutputPort(short)

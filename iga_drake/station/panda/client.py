@@ -27,8 +27,7 @@ from iga_drake.systems.ports import PANDA_JOINTS, ArmMode
 
 # Until the first fresh message of a driver that was there a moment ago (s).
 _START = 0.5
-# The arm's desired position has to be within this (rad) of what was sent in the last _SENT seconds.
-_FOLLOWED, _SENT = 0.01, 0.06
+_SENT = 0.06  # s: the arm's desired position has to be near what was sent in this time
 _STRIKES = 3  # statuses in a row in which it is not
 _HAND_PERIOD = 0.1  # s, after which the hand's command is sent again
 
@@ -192,7 +191,9 @@ class PandaClient(LeafSystem):
         strikes = 0
         if len(desired) == PANDA_JOINTS and len(link.sent) >= round(_SENT / self._period):
             low, high = np.min(link.sent, axis=0), np.max(link.sent, axis=0)
-            if not (np.maximum(low - desired, desired - high) <= _FOLLOWED).all():
+            if not (
+                np.maximum(low - desired, desired - high) <= self._driver.following_error
+            ).all():
                 strikes = link.strikes + 1
         mode = messages.arm_mode(status)
         if mode is ArmMode.READY and strikes >= _STRIKES:

@@ -258,7 +258,7 @@ def test_commands_that_expire_move_nothing_and_are_noticed(moving: Rig, monkeypa
     monkeypatch.setattr(moving.server, "_accept", late)
     moving.advance(0.02)
     held = moving.joints
-    check_held(moving, Cause.ROBOT, "doesn't follow the commands sent", within=0.15)
+    check_held(moving, Cause.ROBOT, "doesn't follow the commands sent", within=0.2)
     np.testing.assert_allclose(moving.joints, held, atol=1e-9)
 
 
