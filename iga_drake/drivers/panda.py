@@ -3,6 +3,7 @@
 It speaks as RobotLocomotion/drake-franka-driver does, in position mode, and trusts no command.
 """
 
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -178,7 +179,7 @@ class PandaBridge:
         return f"{reason}; nothing is let through any more: restart the driver"
 
     def _tell(self, reason: str) -> None:
-        kind = reason[:24]
+        kind = re.sub(r"[-\d.]+", "", reason)
         if kind != self._told:  # not 200 times a second
             self._told = kind
             self._log(reason)

@@ -99,6 +99,7 @@ def test_passes_commands_on_and_tells_the_state():
     for k in range(1, 50):
         drive.send(HOME + 0.01 * k)
         np.testing.assert_allclose(drive.arm.target, HOME + 0.01 * k)
+    drive.step()
     status = drive.status
     np.testing.assert_allclose(status.joint_position, HOME + 0.49)
     np.testing.assert_allclose(status.joint_torque_external, -2.0)  # the other sign on the wire
