@@ -1,10 +1,16 @@
 """`iga drive panda`: between LCM and a Panda or FR3, in position mode, until Ctrl-C."""
 
 import argparse
+import sys
 import threading
 from dataclasses import fields
+from typing import TYPE_CHECKING
 
 from iga_drake.cli.status import SUCCESS
+from iga_drake.errors import IgaDrakeError, check_range, error_text
+
+if TYPE_CHECKING:
+    from iga_drake.drivers.panda import HandBridge
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +44,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     from iga_drake.drivers.franka_rs import FrankaRsArm, FrankaRsHand, connect_franka
     from iga_drake.drivers.panda import DriverLimits, HandBridge, PandaBridge
-    from iga_drake.errors import check_range
 
     speed, url = arguments.speed, arguments.lcm_url
     check_range(0.01 <= speed <= 1.0, "--speed", speed, "0.01 to 1")
@@ -62,6 +67,9 @@ def run(arguments: argparse.Namespace) -> int:
         arm.stop()
 
 
-def _forever(hand: object) -> None:
-    while True:
-        hand.step()  # type: ignore[attr-defined]
+def _forever(hand: "HandBridge") -> None:
+    try:
+        while True:
+            hand.step()
+    except IgaDrakeError as error:  # the station notices that no status comes any more
+        print(f"hand: {error_text(error)}", file=sys.stderr, flush=True)

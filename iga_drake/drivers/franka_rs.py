@@ -4,6 +4,7 @@ It speaks to a Panda (protocol 5) and to an FR3 (protocol 10). The library is im
 and only when an arm is connected to.
 """
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -18,6 +19,7 @@ from iga_drake.systems.ports import ArmMode
 _TORQUE = [20.0] * 4 + [10.0] * 3
 _FORCE = [20.0] * 3 + [25.0] * 3
 _HAND_SPEED = 0.1  # m/s
+_FIRST_STATE = 5.0  # s, for the first state that is one
 _ANY_WIDTH = 0.08  # m: a grasp counts at any width
 _MODES = {
     "idle": ArmMode.IDLE,
@@ -74,6 +76,12 @@ class FrankaRsArm:
     def start(self) -> None:
         """See `Arm`."""
         self.stop()
+        end = time.monotonic() + _FIRST_STATE
+        while not self.state().position.any():  # a server that has just begun says so
+            if time.monotonic() > end:
+                raise DriverError(
+                    "all joints are exactly 0, where no arm can be: restart the robot"
+                )
         with _translated("control"):
             targets = self._robot.joint_targets(fraction=self._speed, backend="robot")
             self._targets = targets.__enter__()

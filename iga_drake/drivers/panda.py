@@ -167,15 +167,16 @@ class PandaBridge:
             )
         if far > limits.step:
             return self._fail(f"a command that jumps by {far:.3f} rad")
-        self._arm.move_to(position)
+        try:
+            self._arm.move_to(position)
+        except DriverError as error:
+            return self._fail(error_text(error))
         self._target, self._accepted = position, now
         self._told = ""
         return ""
 
     def _fail(self, reason: str) -> str:
-        self.fault = reason
-        if self._target is not None:
-            self._arm.move_to(self._target)
+        self.fault = reason  # the arm stays at its last target
         return f"{reason}; nothing is let through any more: restart the driver"
 
     def _tell(self, reason: str) -> None:

@@ -29,6 +29,7 @@ class ObedientArm:
     def __init__(self) -> None:
         self.target, self.offset = HOME.copy(), np.zeros(7)
         self.mode, self.running, self.recovered = ArmMode.READY, False, 0
+        self.refuses = False
 
     def start(self) -> None:
         if self.mode not in (ArmMode.READY, ArmMode.IDLE):
@@ -36,6 +37,8 @@ class ObedientArm:
         self.running, self.mode = True, ArmMode.READY
 
     def move_to(self, position: np.ndarray) -> None:
+        if self.refuses:
+            raise DriverError("target: joint 4 is outside")
         self.target = position.copy()
 
     def state(self) -> ArmState:
@@ -148,6 +151,13 @@ def test_a_bad_command_ends_all_commands(name: str):
     drive.send(HOME + 0.012)
     np.testing.assert_allclose(drive.arm.target, HOME + 0.01)
     assert drive.mode is ArmMode.IDLE
+
+
+def test_what_the_arm_itself_refuses_is_a_fault():
+    drive = Drive()
+    drive.arm.refuses = True
+    drive.send(HOME + 0.01)
+    assert drive.bridge.fault == "target: joint 4 is outside" and drive.mode is ArmMode.IDLE
 
 
 def test_foreign_messages_are_left_out():
