@@ -64,7 +64,8 @@ class FrankaRsArm:
 
     def __init__(self, robot: Any, *, speed: float) -> None:
         """`speed`: share of the robot's velocity, acceleration and jerk limits."""
-        self._robot, self._speed, self._targets = robot, speed, None
+        self._robot, self._speed = robot, speed
+        self._targets: Any = None
         with _translated("collision thresholds"):
             robot.set_collision_behavior_simple(_TORQUE, _TORQUE, _FORCE, _FORCE)
 

@@ -27,7 +27,7 @@ _FORMATS = {
     lcmt_image.PIXEL_FORMAT_DEPTH: ("depth", 1),
     lcmt_image.PIXEL_FORMAT_LABEL: ("label", 1),
 }
-_TYPES = {
+_TYPES: dict[int, np.dtype] = {
     lcmt_image.CHANNEL_TYPE_UINT8: np.dtype("u1"),
     lcmt_image.CHANNEL_TYPE_INT16: np.dtype("i2"),
     lcmt_image.CHANNEL_TYPE_UINT16: np.dtype("u2"),

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from drake import lcmt_panda_status, lcmt_schunk_wsg_status
@@ -127,7 +127,7 @@ class PandaClient(LeafSystem):
         self.DeclarePeriodicPublishEvent(period, 0.0, self._send_arm)
         self.DeclarePeriodicPublishEvent(_HAND_PERIOD, 0.0, self._send_hand)
 
-        def declare(name: str, size: int, read: Callable[[Context, _Link], object]) -> None:
+        def declare(name: str, size: int, read: Callable[[Context, _Link], Any]) -> None:
             def calc(context: Context, output: BasicVector) -> None:
                 output.SetFromVector(np.atleast_1d(read(context, self._read(context))))
 

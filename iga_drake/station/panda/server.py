@@ -135,6 +135,7 @@ class PandaServer(LeafSystem):
         if self._mode == "velocity":
             late = context.get_time() - server.time_accepted > self._expiry
             velocity = np.zeros(PANDA_JOINTS) if late else server.velocity
+            assert server.position is not None
             server = replace(server, position=server.position + velocity * self._period)
         hand = self._hand_input.Eval(context)
         if hand.utime and np.isfinite(hand.target_position_mm):
