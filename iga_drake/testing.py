@@ -7,7 +7,7 @@ def test_our_cell_still_stacks():
 """
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,8 +27,12 @@ def assert_success(
     options: Sequence[str] = (),
     processes: int | None = None,
     replays: Path | str | None = None,
+    on_results: Callable[[list[TrialResult]], None] = lambda results: None,
 ) -> list[TrialResult]:
     """Runs one episode for each seed, each in a process of its own, and returns their results.
+
+    In pytest the fixture of the same name does so with the replays of failures in the test's own
+    folder and the rate in the terminal's summary (`iga_drake.pytest_plugin`).
 
     Args:
       scenario: its file, or the name of one that comes with the package.
@@ -36,9 +40,11 @@ def assert_success(
       at_least: share of the episodes that have to succeed, in [0, 1].
       aligner: its name, or "expert"; default: the scenario's.
       split: whose objects: "test" (never demonstrated) or "demonstration".
-      options: further ones of `iga simulate`, such as "--set=control.linear_speed=0.1".
+      options: further ones of `iga simulate`, such as "--set=control.linear_speed=0.1" or
+        "--demonstrations=FOLDER".
       processes: episodes at a time; default: one for each processor.
       replays: a folder where the episodes that fail leave a replay to look at.
+      on_results: called with all results before they are judged.
 
     Raises:
       AssertionError: fewer succeeded. It shows the rate with its interval, the cause of every
@@ -75,6 +81,7 @@ def assert_success(
     for result in results:
         if result.success and result.seed in pages:
             pages[result.seed].unlink(missing_ok=True)
+    on_results(results)
     succeeded = sum(result.success for result in results)
     if succeeded < at_least * len(results):
         left = [f"replay: {page}" for page in pages.values() if page.is_file()]

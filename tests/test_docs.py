@@ -39,7 +39,7 @@ def anchors(page: Path) -> set[str]:
 def commands(page: Path) -> set[tuple[str, str | None]]:
     """First two words of every `iga ...` in an indented line or in backticks."""
     text = page.read_text(encoding="utf-8")
-    command = r"(?:^    iga|`iga|-m iga_drake\.cli) ([a-z-]+)(?: ([^\s`]+))?"
+    command = r"(?:^    iga|`iga|-m iga_drake\.cli) ([a-z][a-z-]*)(?: ([^\s`]+))?"
     found = re.findall(command, text, re.MULTILINE)
     return {(verb, word or None) for verb, words in found for word in re.split(r"\\?\|", words)}
 

@@ -20,8 +20,11 @@ ORDER = (
 # Usable by every package.
 ROOT_MODULES = {
     f"iga_drake.{name}"
-    for name in ("checkpoint", "errors", "files", "paths", "precision", "registry", "version")
-}
+    for name in (
+        "checkpoint", "cluster", "errors", "files", "paths", "precision", "progress", "registry",
+        "version",
+    )
+}  # fmt: skip
 WITHOUT_DRAKE = ORDER[: ORDER.index("planning")]
 
 

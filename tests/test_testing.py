@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -9,6 +10,8 @@ from iga_drake import cli
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation import task_success
 from iga_drake.testing import assert_success
+
+pytest_plugins = ["pytester"]
 
 
 @pytest.fixture
@@ -72,3 +75,50 @@ def test_the_command_ends_with_one_where_too_few_succeed(
     command = ["evaluate", "tasks", "--tasks", "stack", "--trials", "4", "--aligner", "iga"]
     assert cli.main([*command, "--at-least", rate]) == status
     assert len(episodes) == (0 if status == 2 else 4)
+
+
+def test_reports_and_changes_of_the_command(
+    episodes: list[list[str]], tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """All processes' outcomes are the same: they are decided by the seeds alone."""
+    results, xml, page = (tmp_path / name for name in ("r.jsonl", "r.xml", "r.md"))
+    command = ["evaluate", "tasks", "--tasks", "stack", "--trials", "4", "--aligner", "expert"]
+    assert cli.main([*command, "--results", str(results)]) == 0
+    earlier = results.read_text().replace('"success": true', '"success": false', 1)
+    results.write_text(earlier)
+    capsys.readouterr()
+    reports = ["--compare", str(results), "--junit", str(xml), "--markdown", str(page)]
+    assert cli.main([*command, "--processes", "3", *reports]) == 0
+    assert "mended stack expert seed 0" in capsys.readouterr().out
+    root = ElementTree.parse(xml).getroot()
+    assert [len(case) for case in root.iter("testcase")] == [0, 1, 0, 1]
+    assert "| stack | expert | 2 of 4 |" in page.read_text() and "1 mended" in page.read_text()
+    page.write_text("a thesis")
+    assert cli.main([*command, "--markdown", str(page)]) == cli.BAD_INPUT
+    assert "not overwritten" in capsys.readouterr().err
+
+
+def test_the_fixture_tells_rates_and_keeps_replays(
+    episodes: list[list[str]], pytester: pytest.Pytester
+) -> None:
+    pytester.makepyfile(
+        """
+        def test_cell(assert_success):
+            assert_success("stack", seeds=range(4), at_least=0.5)
+
+        def test_better_cell(assert_success):
+            assert_success("stack", seeds=range(4), at_least=0.9, aligner="icp")
+        """
+    )
+    done = pytester.runpytest_inprocess(
+        "-p", "iga_drake.pytest_plugin", "-p", "no:cacheprovider", "--iga-processes", "2",
+        "--iga-replays", "left", "--junit-xml", "pytest.xml",
+    )  # fmt: skip
+    done.assert_outcomes(passed=1, failed=1)
+    done.stdout.fnmatch_lines(
+        ["*seed 3: contact: dropped*", "*task success*", "*test_cell: stack iga: 2 of 4 (95 % *"]
+    )
+    left = sorted(path.name for path in (pytester.path / "left").iterdir())
+    assert left == [f"stack_{name}_seed_{n}.html" for name in ("icp", "iga") for n in (1, 3)]
+    properties = ElementTree.parse(pytester.path / "pytest.xml").getroot().iter("property")
+    assert {p.attrib["name"] for p in properties} == {"stack iga", "stack icp"}

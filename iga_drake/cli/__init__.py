@@ -11,14 +11,18 @@ import errno
 import importlib
 import logging
 import os
+import platform
 import sys
 import time
 import traceback
 from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
 
+from iga_drake.cli.parser import CommandParser
 from iga_drake.cli.status import BAD_INPUT, FAILURE, INTERNAL, INTERRUPTED, SUCCESS
-from iga_drake.errors import IgaDrakeError, error_text
+from iga_drake.errors import IgaDrakeError, error_text, missing_extra
 from iga_drake.paths import cache_dir
+from iga_drake.version import code_version
 
 __all__ = ["BAD_INPUT", "FAILURE", "INTERNAL", "INTERRUPTED", "SUCCESS", "main"]
 
@@ -40,26 +44,46 @@ COMMANDS = {
     "shapes": "list families, write them as SDF, read meshes",
     "dataset": "write samples to files, print their digests",
     "train": "train the networks of the learned aligners",
+    "names": "print names: of scenarios, tasks, aligners, sets of samples, families, ...",
 }
+_EXAMPLES = """
+  iga simulate grasp --seed 3 --html outputs/grasp.html
+  iga evaluate tasks --tasks grasp,stack --trials 3 --aligner iga
+  iga VERB --help
+"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs `iga` with `arguments` (default: the process's) and returns its exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    parser = argparse.ArgumentParser(prog="iga", description="Few-shot manipulation in Drake.")
-    commands = parser.add_subparsers(dest="command", required=True)
+    parser = CommandParser(
+        prog="iga",
+        description="Few-shot manipulation in Drake.",
+        epilog=f"examples:{_EXAMPLES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="store_true", help="print the versions in use")
+    commands = parser.add_subparsers(dest="command", required=given[:1] != ["--version"])
     for name, text in COMMANDS.items():
         commands.add_parser(name, help=text, add_help=False)
     command = parser.parse_args(given[:1]).command
+    if command is None:
+        print(_versions())
+        return SUCCESS
     # Drake sets its logger's level when it is imported, later than this: a filter stays.
     logging.getLogger("drake").addFilter(_is_warning)
     try:
         module = importlib.import_module(f"iga_drake.cli.{command}")
-        options = argparse.ArgumentParser(prog=f"iga {command}", description=COMMANDS[command])
+        options = CommandParser(prog=f"iga {command}", description=COMMANDS[command])
         module.add_arguments(options)
         return int(module.run(options.parse_args(given[1:])))
     except IgaDrakeError as error:
         print(f"iga {command}: {error_text(error)}", file=sys.stderr)
+        return BAD_INPUT
+    except ImportError as error:
+        if not missing_extra(error):
+            return _internal(command, error)
+        print(f"iga {command}: {missing_extra(error)}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
         print(f"iga {command}: interrupted", file=sys.stderr)
@@ -80,6 +104,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _internal(command, error)  # Drake ends so where a condition of its own is broken
     except Exception as error:
         return _internal(command, error)
+
+
+def _versions() -> str:
+    found = [f"iga-drake {code_version()}", f"Python {platform.python_version()}"]
+    for package in ("drake", "torch", "numpy"):
+        with contextlib.suppress(PackageNotFoundError):
+            found.append(f"{package} {version(package)}")
+    return ", ".join(found)
 
 
 def _internal(command: str, error: BaseException) -> int:

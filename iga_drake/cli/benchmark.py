@@ -4,9 +4,18 @@ import argparse
 
 from iga_drake.cli.subcommands import Subcommand, add_subcommands, run_subcommand
 
+_ABOUT = {
+    "control": "commands to the arm while an inference runs",
+    "data": "samples made, and the cameras against ray casting",
+    "fusion": "depth images to clouds, against Drake's and Open3D's tools",
+    "inference": "one waypoint, of any two aligners",
+    "ik": "motions to random poses, and whether limits hold",
+    "paper-energy": "the paper's energy, against PyTorch Geometric",
+    "training": "training of the descriptors, data included",
+}
 SUBCOMMANDS = {
-    name: Subcommand(f"iga_drake.studies.benchmark_{name.replace('-', '_')}")
-    for name in ("control", "data", "fusion", "inference", "ik", "paper-energy", "training")
+    name: Subcommand(f"iga_drake.studies.benchmark_{name.replace('-', '_')}", about)
+    for name, about in _ABOUT.items()
 }
 
 

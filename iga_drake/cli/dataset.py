@@ -1,10 +1,12 @@
 """`iga dataset`: writes the samples of a set to files, and prints digests of sets."""
 
 import argparse
-import sys
 from pathlib import Path
 
+from tqdm import tqdm
+
 from iga_drake.cli.status import CommandError
+from iga_drake.progress import counter
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,8 +59,12 @@ def _export(arguments: argparse.Namespace) -> int:
     from iga_drake.dataset.export import export_shards
     from iga_drake.dataset.samples import SampleConfig
 
+    shown: list[tqdm] = []
+
     def show(done: int, total: int) -> None:
-        print(f"{done} of {total} shards", file=sys.stderr, flush=True)
+        if not shown:  # those that were there already take no time
+            shown.append(counter("shards", total, done=done))
+        shown[0].update(done - shown[0].n)
 
     result = export_shards(
         arguments.split,
@@ -71,6 +77,7 @@ def _export(arguments: argparse.Namespace) -> int:
         address=arguments.ray or None,
         progress=show,
     )
+    shown[0].close()
     print(
         f"{result.manifest}: {count} samples of '{arguments.split}', {result.made} shards made, "
         f"{result.kept} kept"

@@ -14,8 +14,11 @@ MOST = 10_000
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga demonstrate`."""
     add_scenario_arguments(parser)
-    parser.add_argument("--count", type=int, default=5, help="demonstrations to keep (default 5)")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--count", type=int, default=5, help="demonstrations to keep")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace the demonstrations that are in DIR"
+    )
     parser.add_argument("--seed", type=seed, default=0, help="seed of the first attempt")
 
 
@@ -23,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Records and writes them, or goes on with a recording that was interrupted; nothing of
     somebody else's is overwritten."""
     from iga_drake.demonstrations.recording import Recording
-    from iga_drake.demonstrations.store import check_replaceable, write_demonstrations
+    from iga_drake.demonstrations.store import MANIFEST, check_replaceable, write_demonstrations
     from iga_drake.tasks.episode import record_demonstrations
     from iga_drake.tasks.registry import make_task
     from iga_drake.version import code_version
@@ -33,6 +36,11 @@ def run(arguments: argparse.Namespace) -> int:
     scenario = scenario_of(arguments)
     task = make_task(scenario.task.name).name
     check_replaceable(arguments.out)  # before minutes of recording
+    if (arguments.out / MANIFEST).exists() and not arguments.overwrite:
+        raise CommandError(
+            f"{arguments.out}: holds demonstrations, which are not overwritten: name another "
+            "folder, or add --overwrite"
+        )
     key = {"scenario": scenario.digest, "seed": arguments.seed, "code": code_version()}
     recording = Recording(arguments.out, task=task, key=key)
     try:

@@ -5,28 +5,44 @@ import argparse
 from iga_drake.cli.subcommands import Subcommand, add_subcommands, run_subcommand
 
 SUBCOMMANDS = {
-    "tasks": Subcommand("iga_drake.cli.evaluate_tasks"),
-    "alignment": Subcommand("iga_drake.cli.evaluate_alignment"),
-    "ablations": Subcommand("iga_drake.studies.ablations", "add_ablations", "evaluate_ablations"),
-    "compare": Subcommand("iga_drake.studies.compare", "add_compare", "evaluate_compare"),
+    "tasks": Subcommand("iga_drake.cli.evaluate_tasks", "success of whole episodes"),
+    "alignment": Subcommand("iga_drake.cli.evaluate_alignment", "pose errors on generated samples"),
+    "ablations": Subcommand(
+        "iga_drake.studies.ablations", "what the parts of the iga aligner are worth",
+        "add_ablations", "evaluate_ablations",
+    ),
+    "compare": Subcommand(
+        "iga_drake.studies.compare", "the paper's model beside the default",
+        "add_compare", "evaluate_compare",
+    ),
     "deformations": Subcommand(
-        "iga_drake.studies.deformations", "add_evaluate_deformations", "evaluate_deformations"
+        "iga_drake.studies.deformations", "correspondence and validity of DIF-Net's deformations",
+        "add_evaluate_deformations", "evaluate_deformations",
     ),
     "diagnosis": Subcommand(
-        "iga_drake.studies.diagnosis", "add_evaluate_diagnosis", "evaluate_diagnosis"
+        "iga_drake.studies.diagnosis", "where a checkpoint's error comes from",
+        "add_evaluate_diagnosis", "evaluate_diagnosis",
     ),
     "diversity": Subcommand(
-        "iga_drake.studies.scaling", "add_evaluate_diversity", "evaluate_diversity"
+        "iga_drake.studies.scaling", "error by number and diversity of demonstrations",
+        "add_evaluate_diversity", "evaluate_diversity",
     ),
-    "familiarity": Subcommand("iga_drake.studies.familiarity"),
-    "scaling": Subcommand("iga_drake.studies.scaling", "add_evaluate_scaling", "evaluate_scaling"),
+    "familiarity": Subcommand(
+        "iga_drake.studies.familiarity", "how often own objects are refused, foreign ones accepted"
+    ),
+    "scaling": Subcommand(
+        "iga_drake.studies.scaling", "time and memory by number of demonstrations",
+        "add_evaluate_scaling", "evaluate_scaling",
+    ),
     "stabilisers": Subcommand(
-        "iga_drake.studies.stabilisers", "add_stabilisers", "evaluate_stabilisers"
+        "iga_drake.studies.stabilisers", "what stabilisers do to the paper's energy",
+        "add_stabilisers", "evaluate_stabilisers",
     ),
     "training-log": Subcommand(
-        "iga_drake.studies.training_log", "add_training_log", "evaluate_training_log"
+        "iga_drake.studies.training_log", "training curves",
+        "add_training_log", "evaluate_training_log",
     ),
-}
+}  # fmt: skip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -10,8 +10,15 @@ from typing import TYPE_CHECKING
 
 from iga_drake.aligners.registry import EXPERT
 from iga_drake.cli.options import add_aligner_options, aligner_options, names, seed
-from iga_drake.cli.scenarios import add_overlay_arguments, scenario_of, with_aligner
+from iga_drake.cli.scenarios import (
+    add_demonstrations_argument,
+    add_overlay_arguments,
+    scenario_of,
+    with_aligner,
+)
 from iga_drake.cli.status import FAILURE, INTERNAL, SUCCESS, CommandError
+from iga_drake.files import check_output, write_text
+from iga_drake.progress import counter
 
 if TYPE_CHECKING:
     from iga_drake.evaluation.task_success import Trial, TrialResult
@@ -21,24 +28,53 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga evaluate tasks`."""
     parser.add_argument("--tasks", type=names, default=["grasp", "stack"], help="scenarios")
     add_overlay_arguments(parser)
-    parser.add_argument("--trials", type=int, default=15)
+    add_demonstrations_argument(parser)
+    parser.add_argument("--trials", type=int, default=15, help="of each scenario and aligner")
     parser.add_argument("--aligner", type=names, default=["iga", "icp"], help="names, or expert")
     add_aligner_options(parser)
     parser.add_argument("--seed", type=seed, default=0, help="seed of the first trial")
-    parser.add_argument("--split", choices=("test", "demonstration"), default="test")
-    parser.add_argument("--processes", type=int, default=1, help="episodes at a time")
+    parser.add_argument(
+        "--split", choices=("test", "demonstration"), default="test", help="which object instances"
+    )
+    parser.add_argument(
+        "--processes", type=int, metavar="N",
+        help="episodes at a time (default: 1; with --ray, one for each of the cluster's cores)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--ray", nargs="?", const="", metavar="ADDRESS",
+        help="on a Ray cluster; without address: the local one, started if need be",
+    )  # fmt: skip
     parser.add_argument("--results", type=Path, help="results file to append to and to go on from")
     parser.add_argument(
         "--at-least", type=float, metavar="RATE",
         help="end with 1 where a scenario succeeds less often with one of the aligners, in [0, 1]",
     )  # fmt: skip
+    parser.add_argument(
+        "--compare", type=Path, metavar="FILE",
+        help="earlier results file (of --results): tell which trials changed",
+    )  # fmt: skip
+    parser.add_argument("--junit", type=Path, metavar="FILE", help="write JUnit's XML")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write a summary")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Runs the trials, tells each verdict, prints the table."""
     from iga_drake.evaluation.results import ResultsStore
-    from iga_drake.evaluation.task_success import BROKEN, evaluate, format_table, summarise_trials
+    from iga_drake.evaluation.task_reports import (
+        compare_trials,
+        junit_xml,
+        markdown_summary,
+        read_trials,
+    )
+    from iga_drake.evaluation.task_success import (
+        BROKEN,
+        evaluate,
+        format_table,
+        on_cluster,
+        run_trial,
+        summarise_trials,
+    )
 
     if arguments.trials < 1:
         raise CommandError(f"--trials {arguments.trials}: at least 1 is needed")
@@ -47,20 +83,50 @@ def run(arguments: argparse.Namespace) -> int:
             raise CommandError(f"--{option}: empty, at least one name is needed")
     if arguments.at_least is not None and not 0 <= arguments.at_least <= 1:
         raise CommandError(f"--at-least {arguments.at_least}: must lie in [0, 1]")
+    if arguments.processes is not None and arguments.processes < 1:
+        raise CommandError(f"--processes {arguments.processes}: at least 1 is needed")
+    check_output(arguments.junit, begins=(b"<?xml",))
+    check_output(arguments.markdown, begins=(b"| scenario",))
+    before = read_trials(arguments.compare) if arguments.compare else None
     store = ResultsStore(arguments.results) if arguments.results else None
     trials = _trials(arguments)
+    one, width = run_trial, 1
+    if arguments.ray is not None:
+        one, width = on_cluster(arguments.ray or None)
+    shown = counter("trials", len(trials))
+
+    def show(result: "TrialResult") -> None:
+        shown.write(_line(result), file=sys.stderr)
+        shown.update()
+
     try:
-        results = evaluate(trials, processes=arguments.processes, store=store, on_result=_show)
+        with shown:
+            results = evaluate(
+                trials,
+                processes=arguments.processes or width,
+                store=store,
+                on_result=show,
+                run=one,
+            )
     except KeyboardInterrupt:
         if store:
             print(f"results so far are in {store.path}", file=sys.stderr)
         raise
     summary = summarise_trials(results)
+    comparison = None if before is None else compare_trials(before, results)
     if arguments.json:
         document = {"summary": summary, "trials": [asdict(r) for r in results]}
+        if comparison is not None:
+            document["comparison"] = asdict(comparison) | {"probability": comparison.probability}
         print(json.dumps(document, indent=2))
     else:
         print(format_table(results))
+        if comparison is not None:
+            print("\n" + "\n".join(comparison.lines()))
+    if arguments.junit:
+        write_text(arguments.junit, junit_xml(results))
+    if arguments.markdown:
+        write_text(arguments.markdown, markdown_summary(results, comparison))
     if any(result.cause == BROKEN for result in results):
         return INTERNAL
     if arguments.at_least is not None and any(r["rate"] < arguments.at_least for r in summary):
@@ -80,6 +146,8 @@ def _trials(arguments: argparse.Namespace) -> "list[Trial]":
     paths = [scenario_path(name) for name in arguments.tasks]
     changes = [f"--with={overlay}" for overlay in arguments.overlays]
     changes += [f"--set={override}" for override in arguments.overrides]
+    if arguments.demonstrations:
+        changes.append(f"--demonstrations={arguments.demonstrations.absolute()}")
     trials = []
     for path, label in zip(paths, _labels(paths), strict=True):
         scenario = scenario_of(arguments, str(path))
@@ -111,9 +179,7 @@ def _labels(paths: Sequence[Path]) -> list[str]:
     ]
 
 
-def _show(result: "TrialResult") -> None:
+def _line(result: "TrialResult") -> str:
     verdict = "success" if result.success else f"failure ({result.cause}): {result.reason}"
     reused = " (reused)" if result.reused else ""
-    print(
-        f"{result.scenario} {result.aligner} seed {result.seed}: {verdict}{reused}", file=sys.stderr
-    )
+    return f"{result.scenario} {result.aligner} seed {result.seed}: {verdict}{reused}"

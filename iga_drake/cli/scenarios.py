@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from iga_drake.cli.status import CommandError
@@ -13,7 +14,9 @@ if TYPE_CHECKING:
 
 def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the scenario, and the options of `add_overlay_arguments`."""
-    parser.add_argument("scenario", help="scenario YAML, e.g. diagrams/stack.yaml, or its name")
+    parser.add_argument(
+        "scenario", help="YAML file, e.g. diagrams/stack.yaml, or a name of `iga names scenarios`"
+    )
     add_overlay_arguments(parser)
 
 
@@ -29,6 +32,14 @@ def add_overlay_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def add_demonstrations_argument(parser: argparse.ArgumentParser) -> None:
+    """Adds `--demonstrations`, which goes before what a scenario says."""
+    parser.add_argument(
+        "--demonstrations", type=Path, metavar="DIR",
+        help="folder of demonstrations to work from (default: the scenario's)",
+    )  # fmt: skip
+
+
 def scenario_of(arguments: argparse.Namespace, scenario: str | None = None) -> "Scenario":
     """The scenario (default: the argument's) with the arguments' files and values.
 
@@ -37,7 +48,11 @@ def scenario_of(arguments: argparse.Namespace, scenario: str | None = None) -> "
     from iga_drake.station.scenario import load_scenario
 
     name = scenario or arguments.scenario
-    return load_scenario(name, *arguments.overlays, overrides=arguments.overrides)
+    found = load_scenario(name, *arguments.overlays, overrides=arguments.overrides)
+    folder = getattr(arguments, "demonstrations", None)
+    if folder is not None:
+        found = dataclasses.replace(found, demonstrations=str(folder.expanduser().absolute()))
+    return found
 
 
 def with_aligner(scenario: "Scenario", name: str, options: Mapping[str, Any]) -> "Scenario":

@@ -6,7 +6,12 @@ import sys
 from pathlib import Path
 
 from iga_drake.cli.options import add_aligner_options, aligner_options, seed
-from iga_drake.cli.scenarios import add_scenario_arguments, scenario_of, with_aligner
+from iga_drake.cli.scenarios import (
+    add_demonstrations_argument,
+    add_scenario_arguments,
+    scenario_of,
+    with_aligner,
+)
 from iga_drake.cli.status import FAILURE, SUCCESS
 from iga_drake.files import check_output, write_text
 
@@ -14,7 +19,8 @@ from iga_drake.files import check_output, write_text
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga simulate`."""
     add_scenario_arguments(parser)
-    parser.add_argument("--seed", type=seed, default=0, help="scene, noise and aligner (default 0)")
+    add_demonstrations_argument(parser)
+    parser.add_argument("--seed", type=seed, default=0, help="scene, noise and aligner")
     parser.add_argument(
         "--aligner", metavar="NAME",
         help="default: the scenario's; expert: poses of the scripted expert, which sees all",
@@ -49,6 +55,9 @@ def run(arguments: argparse.Namespace) -> int:
     seed, split = arguments.seed, arguments.split
     with Episode(scenario, seed=seed, split=split, meshcat=meshcat) as episode:
         print(f"{episode.task.name}, seed {seed}, aligner {name}, {split} objects", flush=True)
+        if arguments.demonstrations and episode.demonstrations is not None:
+            used = len(episode.demonstrations)
+            print(f"    the first {used} demonstrations of {arguments.demonstrations}", flush=True)
         result = episode.run(on_event=lambda line: print(line, flush=True))
     if meshcat is not None:
         from iga_drake.viewing.replay import show_prediction, write_html

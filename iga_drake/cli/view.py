@@ -5,17 +5,28 @@ import argparse
 from iga_drake.cli.subcommands import Subcommand, add_subcommands, run_subcommand
 
 SUBCOMMANDS = {
-    "demonstrations": Subcommand("iga_drake.cli.view_demonstrations"),
-    "shapes": Subcommand("iga_drake.viewing.shape_sheets", "add_view_shapes", "view_shapes"),
-    "dataset": Subcommand("iga_drake.viewing.dataset_views", "add_view_dataset", "view_dataset"),
+    "demonstrations": Subcommand("iga_drake.cli.view_demonstrations", "clouds and waypoints in 3D"),
+    "shapes": Subcommand(
+        "iga_drake.viewing.shape_sheets", "a contact sheet for each family",
+        "add_view_shapes", "view_shapes",
+    ),
+    "dataset": Subcommand(
+        "iga_drake.viewing.dataset_views", "samples in 3D or as a sheet",
+        "add_view_dataset", "view_dataset",
+    ),
     "deformations": Subcommand(
-        "iga_drake.studies.deformations", "add_view_deformations", "view_deformations"
+        "iga_drake.studies.deformations", "deformed instances, a sheet for each family",
+        "add_view_deformations", "view_deformations",
     ),
-    "energy": Subcommand("iga_drake.studies.energy_views", "add_view_energy", "view_energy"),
+    "energy": Subcommand(
+        "iga_drake.studies.energy_views", "landscape, correspondences and modes of one alignment",
+        "add_view_energy", "view_energy",
+    ),
     "reconstruction": Subcommand(
-        "iga_drake.studies.encoder_views", "add_view_reconstruction", "view_reconstruction"
+        "iga_drake.studies.encoder_views", "what the local encoder has kept of a cloud",
+        "add_view_reconstruction", "view_reconstruction",
     ),
-}
+}  # fmt: skip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

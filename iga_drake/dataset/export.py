@@ -18,11 +18,13 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from iga_drake.cluster import connect_cluster
 from iga_drake.dataset.loader import SampleDataset, collate, sample_loader
 from iga_drake.dataset.samples import Sample, SampleConfig, make_sample
 from iga_drake.dataset.splits import sample_set
 from iga_drake.errors import IgaDrakeError
 from iga_drake.files import write_bytes
+from iga_drake.progress import progress as followed
 
 FORMAT = "iga-drake-samples"
 VERSION = 1
@@ -94,7 +96,7 @@ def set_digest(
         count=count,
         make=_digest_alone,
     )
-    return _join(batch["value"][0] for batch in loader)
+    return _join(batch["value"][0] for batch in followed(loader, split, total=count))
 
 
 @dataclass(frozen=True)
@@ -328,18 +330,9 @@ def _jobs(
     except ImportError as error:
         raise ExportError(f"{error}: pip install 'iga-drake[cluster]', or use one job") from error
     if backend == "ray":
-        try:
-            import ray
-            from ray.util.joblib import register_ray
-        except ImportError as error:
-            raise ExportError(f"{error}: pip install 'iga-drake[cluster]'") from error
-        if not ray.is_initialized():
-            try:
-                ray.init(address=address, log_to_driver=False)
-            except (ConnectionError, RuntimeError, ValueError) as error:
-                raise ExportError(
-                    f"Ray cluster '{address}': {error}; start one with `ray start --head`"
-                ) from error
+        ray = connect_cluster(address)
+        from ray.util.joblib import register_ray
+
         register_ray()
         width = int(ray.cluster_resources().get("CPU", 1)) if jobs == -1 else jobs
     else:

@@ -6,6 +6,7 @@ or ranks ever make the same sample, their number changes nothing, and a run resu
 
 import dataclasses
 import itertools
+import multiprocessing
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -86,6 +87,14 @@ def _collate_with_index(items: list[tuple[int, Any]]) -> Batch:
     return batch
 
 
+def _processes() -> Any:
+    """How workers are started: as copies of a fresh process, since copies of this one would crash
+    where it runs threads of others (Ray's, say)."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    return context
+
+
 def _start_worker(_: int) -> None:
     """One thread a worker: the workers share the cores."""
     torch.set_num_threads(1)
@@ -157,6 +166,7 @@ def sample_loader(
         collate_fn=_collate_with_index,
         worker_init_fn=_start_worker,
         prefetch_factor=prefetch if workers else None,
+        multiprocessing_context=_processes() if workers else None,
         generator=torch.Generator(),  # leaves the caller's random numbers alone
     )
     return SampleLoader(loader, split)

@@ -32,6 +32,7 @@ from iga_drake.dataset.samples import Sample, make_sample
 from iga_drake.dataset.splits import sample_set, sample_sets
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, config_digest
+from iga_drake.progress import progress
 
 FIVE_SETS = (
     "seen_alignments",
@@ -239,7 +240,7 @@ def evaluate_alignment(
         "code": code_key(aligner),
     }
     rows: list[SampleErrors] = []
-    for index in range(count):
+    for index in progress(range(count), f"{name}, {split}{field and f' ({field})'}"):
         key = {**common, "index": index}
         known = store.get(key) if store else None
         if known is not None:

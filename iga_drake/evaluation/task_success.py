@@ -16,7 +16,8 @@ from statistics import NormalDist
 from typing import Any
 
 from iga_drake.aligners.registry import EXPERT, make_aligner
-from iga_drake.errors import IgaDrakeError
+from iga_drake.cluster import connect_cluster
+from iga_drake.errors import IgaDrakeError, error_text
 from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, folder_digest
 from iga_drake.files import process_lives
 from iga_drake.station.scenario import Scenario
@@ -145,8 +146,30 @@ def run_trial(trial: Trial, *, timeout: float = 1800.0) -> TrialResult:
             _let_go(held)
         if path.is_file():
             return _result(trial, json.loads(path.read_text(encoding="utf-8")))
-    broken = {"task": trial.task, "success": False, "cause": BROKEN, "reason": reason}
-    return _result(trial, broken)
+    return _broken(trial, reason)
+
+
+def on_cluster(address: str | None) -> tuple[Callable[[Trial], TrialResult], int]:
+    """`run_trial` on a Ray cluster (None: the local one), and how many it can run at a time.
+
+    Its machines need this package, and the scenario, demonstrations and folders of replays at the
+    same paths. A trial whose machine is lost is run again on another. Raises `ClusterError`.
+    """
+    ray = connect_cluster(address)
+    remote = ray.remote(num_cpus=1, max_retries=2)(run_trial)
+
+    def run(trial: Trial) -> TrialResult:
+        try:
+            return ray.get(remote.remote(trial))
+        except ray.exceptions.RayError as error:
+            return _broken(trial, error_text(error))
+
+    return run, max(1, int(ray.cluster_resources().get("CPU", 1)))
+
+
+def _broken(trial: Trial, reason: str) -> TrialResult:
+    row = {"task": trial.task, "success": False, "cause": BROKEN, "reason": reason}
+    return _result(trial, row)
 
 
 def _let_go(held: int) -> None:
@@ -203,7 +226,8 @@ def evaluate(
             if ended.is_set():
                 return result  # of a process that was ended
             if store and result.cause != BROKEN:
-                store.add(trial.whole_key, {n: getattr(result, n) for n in _MEASURED})
+                row = {"scenario": trial.scenario}
+                store.add(trial.whole_key, row | {n: getattr(result, n) for n in _MEASURED})
         on_result(result)
         return result
 

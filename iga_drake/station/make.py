@@ -23,6 +23,11 @@ _REGISTRY: Registry[Diagram] = Registry(
 )
 
 
+def station_names() -> list[str]:
+    """The names that a scenario's `station` may have, sorted."""
+    return _REGISTRY.names()
+
+
 def make_station(
     scenario: Scenario,
     *,

@@ -152,7 +152,8 @@ class Scenario:
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     task: TaskChoice = field(default_factory=TaskChoice)
     aligner: AlignerChoice = field(default_factory=AlignerChoice)
-    # Folder with the demonstrations; a relative path starts at `models/`.
+    # Folder with the demonstrations; a relative path starts where the file that states it lies, or
+    # at `models/` where there is no such folder.
     demonstrations: str = "demonstrations/grasp"
     # The first so many demonstrations make up the aligner's context; all if there are fewer.
     context_size: int = 3
@@ -166,8 +167,9 @@ class Scenario:
 
     @property
     def digest(self) -> str:
-        """First 16 hexadecimal digits of the SHA-256 of `to_yaml()`; file names don't matter."""
-        return hashlib.sha256(self.to_yaml().encode()).hexdigest()[:16]
+        """First 16 hexadecimal digits of the SHA-256 of `to_yaml()`; files' places don't matter."""
+        said = dataclasses.replace(self, demonstrations=Path(self.demonstrations).name)
+        return hashlib.sha256(said.to_yaml().encode()).hexdigest()[:16]
 
     def to_yaml(self) -> str:
         """The whole scenario, defaults included, as text that `load_scenario` reads back."""
@@ -213,6 +215,9 @@ def load_scenario(
                 f"{file}: {size} bytes, a scenario has at most {_LARGEST_FILE}: is it another file?"
             )
         scenario = _layered(scenario, text, str(file))
+        if _states(text, "demonstrations"):
+            beside = _beside(file, scenario.demonstrations)
+            scenario = dataclasses.replace(scenario, demonstrations=beside)
     for override in overrides:
         text = _override_text(override, scenario)
         scenario = _layered(scenario, text, _cut(override), keep_maps=True)
@@ -235,6 +240,21 @@ def scenario_path(name: str | Path) -> Path:
             f"scenario {_cut_path(name)}: no such file; name a YAML file or one of: {known}"
         )
     return path
+
+
+def _states(text: str, key: str) -> bool:
+    """Whether YAML text has a key at its top level."""
+    node = yaml.compose(text, Loader=yaml.SafeLoader)
+    return isinstance(node, yaml.MappingNode) and any(k.value == key for k, _ in node.value)
+
+
+def _beside(file: Path, folder: str) -> str:
+    """A relative folder as an absolute one, where it lies beside `file`; else as it is."""
+    try:
+        place = file.absolute().parent / folder
+        return str(place.resolve()) if not Path(folder).is_absolute() and place.is_dir() else folder
+    except (OSError, ValueError, RuntimeError):  # no path
+        return folder
 
 
 def _override_text(override: str, scenario: Scenario) -> str:

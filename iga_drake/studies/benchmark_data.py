@@ -15,6 +15,7 @@ from iga_drake.dataset import samples
 from iga_drake.dataset.depth_camera import visible
 from iga_drake.dataset.samples import make_sample
 from iga_drake.errors import IgaDrakeError
+from iga_drake.progress import progress
 from iga_drake.training.log import resident_memory
 
 # Stage: functions whose cumulative times add up to it.
@@ -31,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--set", default="train", help="set of samples (default train)")
     parser.add_argument("--count", type=int, default=200, help="samples made (default 200)")
     parser.add_argument("--first", type=int, default=0, help="index of the first")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--json", action="store_true", help="print as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -43,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
         make_sample(arguments.set, arguments.first + k)
     before = resident_memory()["memory_mib"]
     seconds = []
-    for k in range(arguments.count):
+    for k in progress(range(arguments.count), "samples"):
         began = time.perf_counter()
         make_sample(arguments.set, arguments.first + k)
         seconds.append(time.perf_counter() - began)

@@ -18,6 +18,7 @@ from pydrake.perception import Concatenate, DepthImageToPointCloud
 from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I
 
 from iga_drake.errors import IgaDrakeError
+from iga_drake.progress import progress
 from iga_drake.station.cameras.rgbd import camera_info
 from iga_drake.station.make import make_station
 from iga_drake.station.panda.model import HOME_POSITION
@@ -79,7 +80,7 @@ def benchmark_fusion(*, json: bool = False, repetitions: int = 15) -> dict:
     times: dict[str, list[float]] = {name: [] for name in runs}
     cpu_times: dict[str, list[float]] = {name: [] for name in runs}
     points = {name: run() for name, run in runs.items()}  # and warm up
-    for _ in range(repetitions):  # by turns: a busy machine is as unfair to all
+    for _ in progress(range(repetitions), "runs"):  # by turns: a busy machine is as unfair to all
         for name, run in runs.items():
             start, cpu_start = time.perf_counter(), time.process_time()
             run()

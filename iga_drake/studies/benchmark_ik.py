@@ -16,6 +16,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from iga_drake.errors import IgaDrakeError
 from iga_drake.planning.inverse_kinematics import PoseSolver
 from iga_drake.planning.planning_robot import PlanningConfig, PlanningRobot
+from iga_drake.progress import progress
 from iga_drake.station.panda.planning import make_panda_planning_robot
 from iga_drake.station.scenario import Scenario
 from iga_drake.systems.differential_ik import DifferentialIk
@@ -168,7 +169,7 @@ def benchmark_ik(count: int = 1000, seed: int = 0, json: bool = False) -> IkBenc
     random = np.random.default_rng(seed)
     start, reached = time.perf_counter(), 0
     solve_seconds = 0.0
-    for sequence in range(1, count + 1):
+    for sequence in progress(range(1, count + 1), "poses"):
         solve_start = time.perf_counter()
         posture, X_WE = random_reachable_pose(solver, random, near=robot.home)
         solve_seconds += time.perf_counter() - solve_start

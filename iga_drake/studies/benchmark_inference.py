@@ -24,6 +24,7 @@ from iga_drake.aligners.registry import aligner_names, make_aligner
 from iga_drake.dataset.samples import make_sample
 from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.errors import IgaDrakeError
+from iga_drake.progress import progress
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stages", action="store_true", help="where iga's time goes, on one thread and on two"
     )
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--json", action="store_true", help="print as JSON")
 
 
 def _untrained_paper(size: str) -> Aligner:
@@ -62,7 +63,7 @@ def _times(aligner: Aligner, count: int, demonstrations: int) -> tuple[np.ndarra
     """Seconds (count,) of a waypoint, and what was spent on its demonstrations before."""
     seconds, before = [], []
     prepare: Callable[..., None] = getattr(aligner, "prepare", lambda context: None)
-    for index in range(count + 1):  # the first warms up
+    for index in progress(range(count + 1), "waypoints"):  # the first warms up
         problem = _problem(index, demonstrations)
         began = time.perf_counter()
         prepare(problem[0])
@@ -82,7 +83,7 @@ def stage_seconds(
     torch.set_num_threads(threads)
     rows = []
     try:
-        for index in range(count + 1):  # the first warms up
+        for index in progress(range(count + 1), "waypoints"):  # the first warms up
             problem = _problem(index, demonstrations)
             first = aligner.explain(*problem, seed=index).seconds
             began = time.perf_counter()

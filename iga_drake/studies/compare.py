@@ -39,6 +39,7 @@ from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.alignment import COLUMNS, Errors
 from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, config_digest
 from iga_drake.files import write_text
+from iga_drake.progress import progress
 from iga_drake.training.correspondence import LOSS_FIELDS, DescriptorTraining, descriptor_loss
 from iga_drake.training.paper import (
     ENERGIES,
@@ -260,7 +261,7 @@ def compare(
         "code": code_key(entry.aligner),
     }
     rows, seconds, reused = [], [], 0
-    for index in range(count):
+    for index in progress(range(count), f"{entry.name}, {split}"):
         key = {**common, "index": index}
         known = store.get(key) if store else None
         if known is not None:
@@ -392,7 +393,7 @@ def add_compare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch")
     parser.add_argument("--png", type=Path, metavar="OUT", help="figure")
     parser.add_argument("--card", type=Path, metavar="OUT", help="model card of one aligner")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--json", action="store_true", help="print as JSON")
 
 
 def evaluate_compare(arguments: argparse.Namespace) -> None:

@@ -14,6 +14,7 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 
+from iga_drake.progress import progress
 from iga_drake.shapes.deformers import LatticeDeformer, PartDeformer, ReinstancingDeformer
 from iga_drake.shapes.deformers.dif_net import DifNetDeformer, default_dif_net_weights
 from iga_drake.shapes.deformers.protocol import DeformableShape, Deformer
@@ -57,7 +58,7 @@ def correspondence_errors(
     shapes = training_shapes(config)
     faces = shapes[0][1]
     errors: list[list[np.ndarray]] = [[], []]
-    for _ in range(pairs):
+    for _ in progress(range(pairs), "pairs"):
         pair = rng.choice(len(shapes), 2, replace=False)
         mesh = trimesh.Trimesh(shapes[pair[1]][0], faces, process=False)
         face = rng.choice(len(faces), points, p=mesh.area_faces / mesh.area)
@@ -130,7 +131,7 @@ def validity(
 ) -> Validity:
     """Validity of deformed meshes over `draws` random instances of each of the families `names`."""
     rows = []
-    for name in names:
+    for name in progress(names, "families"):
         for k in range(draws):
             rng = np.random.default_rng((seed, k))
             family = FAMILIES[name]

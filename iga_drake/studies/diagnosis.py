@@ -36,6 +36,7 @@ from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.alignment import COLUMNS, EVALUATION_SETS, FLIP, Errors
 from iga_drake.geometry.rigid_fit import rigid_fit
 from iga_drake.geometry.se3 import geodesic_angle, kabsch, rigid, so3_exp, transform
+from iga_drake.progress import progress
 from iga_drake.training.correspondence import DescriptorTraining
 
 WRONG = np.radians(FLIP)  # a coarse hypothesis further off than this is wrong
@@ -589,7 +590,8 @@ def evaluate_diagnosis(arguments: argparse.Namespace) -> int:
     aligner = IgaAligner(weights=arguments.weights)
     document = []
     for split in arguments.sets:
-        rows = [diagnose_sample(aligner, split, index) for index in range(arguments.count)]
+        indices = progress(range(arguments.count), split)
+        rows = [diagnose_sample(aligner, split, index) for index in indices]
         summary = summarise_diagnoses(rows)
         if arguments.json:
             document.append({**asdict(summary), "samples": [asdict(row) for row in rows]})

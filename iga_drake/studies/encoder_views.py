@@ -18,6 +18,7 @@ from iga_drake.dataset.occupancy import OccupancyConfig, OccupancySample, make_o
 from iga_drake.dataset.splits import sample_set
 from iga_drake.geometry.clouds import furthest_point_sampling
 from iga_drake.paths import models_dir
+from iga_drake.progress import progress
 from iga_drake.viewing.dataset_views import MOST_ROWS, ViewError, balls
 
 BLUE, YELLOW = (0.25, 0.45, 0.9), (1.0, 0.85, 0.1)
@@ -52,7 +53,7 @@ def reconstruction_sheet(
     samples = samples or OccupancyConfig()
     box = dataclasses.replace(samples, queries=in_box, near=())
     tiles = []
-    for index in indices:
+    for index in progress(indices, "clouds"):
         beside = make_occupancy_sample(split, index, samples)
         uniform = make_occupancy_sample(split, index, box)  # of the same cloud
         chosen = furthest_point_sampling(torch.from_numpy(beside.points)[None], centres)

@@ -20,6 +20,7 @@ from iga_drake.dataset.foreign import FOREIGN_KINDS, foreign_points, foreign_sam
 from iga_drake.dataset.samples import make_sample
 from iga_drake.dataset.splits import sample_set
 from iga_drake.errors import IgaDrakeError
+from iga_drake.progress import progress
 
 THRESHOLDS = (0.1, 0.3, 0.5, 0.7, 0.9)
 DEFAULT_SETS = ("unseen_instances", "unseen_categories")
@@ -79,7 +80,7 @@ def measure_familiarity(aligner: Aligner, split: str, count: int) -> Familiarity
     """
     own: list[float] = []
     foreign: list[float] = []
-    for index in range(count):
+    for index in progress(range(count), split):
         points = make_sample(split, index, CONFIG).points
         mixed = foreign_points(points, foreign_sample(split, index, CONFIG).points, index)
         for asked, values in ((points, own), (mixed, foreign)):

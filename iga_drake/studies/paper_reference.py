@@ -32,7 +32,7 @@ def _library() -> Any:
         import torch_geometric.nn
     except ModuleNotFoundError as error:
         raise IgaDrakeError(
-            "PyTorch Geometric is not installed: pip install torch_geometric"
+            "PyTorch Geometric is not installed: pip install 'iga-drake[geometric]'"
         ) from error
     return torch_geometric.nn
 

@@ -19,6 +19,7 @@ from iga_drake.aligners.iga.aligner import Explanation, IgaAligner
 from iga_drake.dataset.splits import sample_set
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.alignment import COLUMNS, Errors
+from iga_drake.progress import progress
 from iga_drake.studies.diagnosis import Problem
 from iga_drake.viewing.figures import check_figure, new_figure, write_figure
 
@@ -149,7 +150,7 @@ def measure_costs(
     _check(split, numbers, count)
     rows: dict[int, list[tuple]] = {n: [] for n in numbers}
     memory = dict.fromkeys(numbers, 0)
-    for index in range(count):
+    for index in progress(range(count), split):
         problem = Problem.of(split, index)
 
         def run(n: int, problem: Problem = problem, index: int = index) -> Explanation:
@@ -264,7 +265,7 @@ def diversity_errors(
     """Errors over the first `count` samples of a set, with its first demonstrations each."""
     _check(split, numbers, count)
     errors: dict[int, list[tuple[float, float]]] = {n: [] for n in numbers}
-    for index in range(count):
+    for index in progress(range(count), split):
         problem = Problem.of(split, index)
         for n in numbers:
             estimate = problem.with_first(n).query.ask(aligner, index)

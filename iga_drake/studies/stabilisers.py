@@ -23,6 +23,7 @@ from iga_drake.dataset.loader import collate
 from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.errors import IgaDrakeError
 from iga_drake.geometry.se3 import geodesic_angle, so3_exp
+from iga_drake.progress import progress
 from iga_drake.training.paper import (
     ENERGIES,
     PaperTraining,
@@ -76,7 +77,7 @@ def measure_convergence(
     else:
         search = dataclasses.replace(search, rotation_rate=0.0)
     before, after, uphill = [], [], []
-    for index in range(count):
+    for index in progress(range(count), part):
         batch = collate([make_sample(split, index, samples)])
         asked = problem(nodes_of(batch, model, config.frames, device)[0])
         generator = torch.Generator(device).manual_seed(index)
@@ -162,7 +163,7 @@ def add_stabilisers(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ablations", default=",".join(ABLATIONS), help="which, comma-separated")
     parser.add_argument("--minutes", type=float, default=math.inf, help="of each training")
     parser.add_argument("--count", type=int, default=20, help="training samples looked at")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--json", action="store_true", help="print as JSON")
 
 
 def evaluate_stabilisers(arguments: argparse.Namespace) -> None:

@@ -580,6 +580,7 @@ def record_demonstrations(
     if count < 1:
         raise TaskError(f"demonstrations: {count} asked for, at least 1 is needed")
     kept: list[Demonstration] = []
+    began, ran = wall.perf_counter(), 0
     for seed in range(first_seed, first_seed + 2 * count + 1):
         before = recording is not None and recording.done(seed)
         if on_event:
@@ -592,8 +593,12 @@ def record_demonstrations(
                 found = episode.demonstration() if episode.run(on_event).success else None
             if recording is not None:
                 recording.add(seed, found)
+            ran += 1
         if found is not None:
             kept.append(found)
+        if on_event and ran and len(kept) < count:
+            left = (wall.perf_counter() - began) / ran * (count - len(kept))
+            on_event(f"{len(kept)} of {count} recorded, about {left:.0f} s to go")
         if len(kept) == count:
             return DemonstrationSet(task=scenario.task.name, demonstrations=tuple(kept))
     raise TaskError(

@@ -96,7 +96,7 @@ def union(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
         whole = trimesh.boolean.union(parts, engine="manifold")
     except (ImportError, ValueError) as error:
         raise ShapeError(
-            f"union of {len(parts)} parts: {error}; pip install 'iga-drake[train]'"
+            f"union of {len(parts)} parts: {error}; pip install 'iga-drake[dif-net]'"
         ) from error
     if not whole.is_watertight:
         raise ShapeError(f"union of {len(parts)} parts: not watertight")
@@ -115,7 +115,9 @@ def sample_sdf(
     try:
         import igl
     except ImportError as error:
-        raise ShapeError("signed distances need libigl: pip install 'iga-drake[train]'") from error
+        raise ShapeError(
+            "signed distances need libigl: pip install 'iga-drake[dif-net]'"
+        ) from error
     rng = np.random.default_rng(seed)
     whole = union(Normalisation.of(vertices).apply(vertices), faces)
     surface, face = trimesh.sample.sample_surface(whole, count, seed=rng)

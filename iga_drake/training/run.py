@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from iga_drake.checkpoint import load_checkpoint, save_checkpoint
 from iga_drake.files import PARTIAL
+from iga_drake.progress import counter
 from iga_drake.training.log import TrainingLog, resident_memory
 from iga_drake.training.muon import Muon
 from iga_drake.training.ranks import Ranks
@@ -195,6 +196,8 @@ class TrainingRun:
             for path in left_over:
                 path.unlink(missing_ok=True)
             self._log = TrainingLog(folder, self.step, tensorboard=self._options.tensorboard)
+        shown = self.ranks.first and self.step < config.steps
+        self._counter = counter(kind, config.steps, done=self.step) if shown else None
         self._commit = _commit()
         self._began = self._saved_at = time.monotonic()
         self._row_began = (self._began, self.samples_seen)
@@ -273,6 +276,8 @@ class TrainingRun:
         for optimizer in self._optimizers:
             optimizer.step()
         self.step += 1
+        if self._counter is not None:
+            self._counter.update()
         self.samples_seen += self.config.batch * self.config.accumulate * self.ranks.world
         rate = min(self.config.ema, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
@@ -374,6 +379,8 @@ class TrainingRun:
 
     def close(self) -> None:
         """Ends the log."""
+        if self._counter is not None:
+            self._counter.close()
         if self._log:
             self._log.close()
 

@@ -1,6 +1,7 @@
 """The loader: one stream, whoever makes it."""
 
 import itertools
+import multiprocessing
 import os
 from dataclasses import dataclass
 
@@ -8,6 +9,7 @@ import numpy as np
 import psutil
 import pytest
 import torch
+from torch.utils.data import _utils
 
 from iga_drake.dataset.loader import LoaderError, collate, sample_loader
 from iga_drake.dataset.samples import SampleConfig, make_sample
@@ -96,19 +98,21 @@ def test_a_failed_sample_is_named(workers: int) -> None:
         list(itertools.islice(loader, 4))
 
 
-def test_a_dead_worker_is_an_error_not_a_hang() -> None:
+def test_a_dead_worker_is_an_error_not_a_hang(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_utils, "MP_STATUS_CHECK_INTERVAL", 0.2)  # s
     loader = sample_loader("s", batch=2, workers=2, make=dying)
     with pytest.raises(LoaderError, match="worker process that makes samples of 's' died"):
         list(itertools.islice(loader, 8))
 
 
 def test_workers_have_one_thread_and_are_gone_afterwards() -> None:
-    before = set(psutil.Process().children())
+    before = set(multiprocessing.active_children())
     loader = iter(sample_loader("s", batch=1, workers=1, make=threads))
     assert next(loader)["values"].item() == 1
-    assert set(psutil.Process().children()) - before
+    (worker,) = set(multiprocessing.active_children()) - before
+    assert psutil.pid_exists(worker.pid)
     del loader
-    assert not {p for p in set(psutil.Process().children()) - before if p.is_running()}
+    assert not psutil.pid_exists(worker.pid)
 
 
 def threads(split: str, index: int, config: SampleConfig | None) -> Cheap:

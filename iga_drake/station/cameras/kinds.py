@@ -41,6 +41,11 @@ _REGISTRY: Registry[CameraKind] = Registry(
 )
 
 
+def camera_names() -> list[str]:
+    """The names of all kinds of cameras, sorted."""
+    return _REGISTRY.names()
+
+
 def camera_type() -> Any:
     """The union of all kinds' dataclasses, the plain RGB-D camera first: it needs no tag."""
     kinds = [_REGISTRY.factory(name) for name in _REGISTRY.names()]
