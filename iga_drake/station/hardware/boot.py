@@ -43,16 +43,13 @@ def boot_panda(
     """
     statuses: list[lcmt_panda_status] = []
     hands: list[lcmt_schunk_wsg_status] = []
-    received: list[Any] = [
-        lcm.Subscribe(messages.STATUS_CHANNEL, _keeper(lcmt_panda_status, statuses)),
-        lcm.Subscribe(messages.HAND_STATUS_CHANNEL, _keeper(lcmt_schunk_wsg_status, hands)),
-    ]
+    lcm.Subscribe(messages.STATUS_CHANNEL, _keeper(lcmt_panda_status, statuses))
+    lcm.Subscribe(messages.HAND_STATUS_CHANNEL, _keeper(lcmt_schunk_wsg_status, hands))
     end = time.monotonic() + limit
     while len(statuses) < _STATUSES or not hands:
         left = end - time.monotonic()
         if lcm.HandleSubscriptions(max(0, min(int(1000 * left), 50))) == 0 and left <= 0:
             break
-    del received
     url = lcm.get_lcm_url()
     for channel, kind, found, wanted in (
         (messages.STATUS_CHANNEL, "arm", len(statuses), _STATUSES),

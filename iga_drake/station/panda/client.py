@@ -178,7 +178,9 @@ class PandaClient(LeafSystem):
         assert link.offset is not None
         status = self._status_input.Eval(context)
         time = 1e-6 * status.utime - link.offset
-        if status.utime == 0 or not self._is_next(context, time, link.time, link.live):
+        if status.utime == 0 or not self._is_next(
+            context, time, link.time, link.live, fresh=self._driver.expiry / 2
+        ):
             return link
         rows = [
             status.joint_position, status.joint_velocity, status.joint_torque_external,
@@ -216,15 +218,16 @@ class PandaClient(LeafSystem):
         opening = status.actual_position_mm / 1000.0
         if status.utime == 0 or not np.isfinite(opening):
             return link
-        if not self._is_next(context, time, link.hand_time, link.hand_live):
+        fresh = _HAND_PERIOD + self._driver.expiry
+        if not self._is_next(context, time, link.hand_time, link.hand_live, fresh=fresh):
             return link
         return replace(link, opening=opening, hand_time=time, hand_live=True)
 
-    def _is_next(self, context: Context, time: float, last: float, live: bool) -> bool:
-        """Whether a message is newer than the last, or the first that is fresh."""
-        if live:
-            return time > last
-        return abs(context.get_time() - time) <= self._driver.expiry + _HAND_PERIOD
+    def _is_next(
+        self, context: Context, time: float, last: float, live: bool, *, fresh: float
+    ) -> bool:
+        """Whether a message is newer than the last, or the first that isn't from before."""
+        return time > last if live else abs(context.get_time() - time) <= fresh
 
     def _send_arm(self, context: Context) -> EventStatus:
         link = self._read(context)

@@ -13,7 +13,7 @@ from rig import EPOCH, START, Rig, hardware_scenario
 from iga_drake.station.contract import check_port_contract
 from iga_drake.station.lcm import utime_of
 from iga_drake.station.panda import messages
-from iga_drake.station.panda.messages import COMMAND_CHANNEL
+from iga_drake.station.panda.messages import COMMAND_CHANNEL, STATUS_CHANNEL
 from iga_drake.systems.messages import Cause
 from iga_drake.systems.ports import ArmMode
 
@@ -192,6 +192,27 @@ def test_what_a_network_does_every_day_is_no_fault(moving: Rig, link: Link):
     assert not moving.status.holding, moving.status
     assert moving.joints[6] > before + 0.1
     assert times == sorted(times)  # never back in time
+
+
+def test_messages_from_before_the_start_are_left_out(rig: Rig):
+    """Those that waited in the network's buffer while the diagram was built."""
+    for age in (5.0, 0.1):
+        rig.restart()
+        status = messages.arm_status(
+            position=START + 0.3,
+            velocity=np.zeros(7),
+            torque_external=np.zeros(7),
+            position_desired=START,
+            mode=ArmMode.READY,
+            utime=utime_of(EPOCH - age),
+        )
+        rig.lcm.Publish(STATUS_CHANNEL, status.encode())
+        rig.server.link = _silent
+        rig.advance(0.005)
+        np.testing.assert_array_equal(rig.read("panda.position_measured"), START)
+        rig.server.link = None
+        rig.advance(0.2)
+        assert not rig.status.holding and rig.joints[6] > START[6] + 0.01
 
 
 def test_a_driver_that_is_started_anew_gets_no_commands(moving: Rig):
