@@ -286,12 +286,15 @@ class Episode:
                 seed=draws,
                 meshcat=meshcat,
             )
-            if not self.robot.station.HasSubsystemNamed("plant"):
+            station = self.robot.station
+            if station.HasSubsystemNamed("simulated"):  # behind the hardware station
+                station = station.GetSubsystemByName("simulated")
+            if not station.HasSubsystemNamed("plant"):
                 raise TaskError(
                     f"station '{scenario.station}': no subsystem 'plant' found; an episode knows "
                     "the true state from it and needs a simulated station"
                 )
-            self._plant = self.robot.station.GetSubsystemByName("plant")
+            self._plant = station.GetSubsystemByName("plant")
             self._panda = find_panda(self._plant)
             self.simulator = Simulator(self.robot.diagram)
             self._build_seconds = wall.perf_counter() - began

@@ -31,7 +31,7 @@ from iga_drake.systems.supervisor import Supervisor
 from iga_drake.systems.waypoint_follower import WaypointFollower
 from iga_drake.viewing.policy_views import add_policy_views
 
-# Every wire of the robot but the cameras' (`add_fusion`): "system.port" of the source -> those of
+# Every wire of the robot but the cameras': "system.port" of the source -> those of
 # the sinks. The station's own ports have names with a dot as well: the system is the first part.
 WIRES: Mapping[str, tuple[str, ...]] = {
     "station.panda.position_measured": (
@@ -47,6 +47,9 @@ WIRES: Mapping[str, tuple[str, ...]] = {
         "external_force.torque_external",
         "supervisor.torque_external",
     ),
+    "station.panda.time": ("supervisor.arm_time",),
+    "station.hand.time": ("supervisor.hand_time",),
+    "station.panda.mode": ("supervisor.mode",),
     "fusion.target_cloud": ("policy.target_cloud",),
     "fusion.grasped_cloud": ("policy.grasped_cloud",),
     "fusion.camera_counts": ("policy.camera_counts",),
@@ -126,7 +129,10 @@ def build_robot_diagram(
         ("policy", policy),
         ("follower", WaypointFollower(solver=solver, config=scenario.control)),
         ("differential_ik", DifferentialIk(robot, scenario.differential_ik, period=period)),
-        ("supervisor", Supervisor(robot, scenario.supervisor, period=period)),
+        (
+            "supervisor",
+            Supervisor(robot, scenario.supervisor, period=period, cameras=scenario.camera_names),
+        ),
     ):
         systems[name] = builder.AddNamedSystem(name, system)
     for source, sinks in WIRES.items():
@@ -136,6 +142,9 @@ def build_robot_diagram(
             builder.Connect(systems[output].GetOutputPort(port), systems[into].GetInputPort(name))
     if meshcat is not None:
         _add_views(builder, scenario, systems, meshcat, motion, demonstrations)
+    for camera in scenario.camera_names:
+        port = f"{camera}.time"
+        builder.Connect(station.GetOutputPort(port), systems["supervisor"].GetInputPort(port))
     diagram = builder.Build()
     diagram.set_name("robot")
     return RobotDiagram(diagram=diagram, station=station, fusion=fusion, policy=policy)
