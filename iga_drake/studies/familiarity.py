@@ -29,7 +29,7 @@ DEFAULT_FIELDS = ("ring", "half", "stray")
 
 
 @dataclass(frozen=True)
-class Asked:
+class FamiliarityRow:
     """One question and its answer."""
 
     index: int
@@ -40,7 +40,7 @@ class Asked:
 
 def measure_familiarity(
     aligner: Aligner, split: str, count: int, fields: tuple[str, ...] = DEFAULT_FIELDS
-) -> list[Asked]:
+) -> list[FamiliarityRow]:
     """The questions about the first `count` samples of a set: four and more of each sample, the
     kinds of FOREIGN_KINDS in turn; ways up are given in every other sample.
 
@@ -63,23 +63,23 @@ def measure_familiarity(
                     f"aligner {aligner.name}: gives no familiarity: use iga with its landed weights"
                 )
             right = name not in FOREIGN_KINDS and is_right(question, sample, estimate.poses[0])
-            rows.append(Asked(index, name, float(estimate.familiarity.min()), right))
+            rows.append(FamiliarityRow(index, name, float(estimate.familiarity.min()), right))
     return rows
 
 
-def refused(rows: list[Asked], kind: str, threshold: float) -> float:
+def refused(rows: list[FamiliarityRow], kind: str, threshold: float) -> float:
     """Share of the questions of a kind below a threshold; NaN where there are none."""
     values = np.array([row.familiarity for row in rows if row.kind == kind])
     return float((values < threshold).mean()) if len(values) else float("nan")
 
 
-def right_or_refused(rows: list[Asked], kind: str, threshold: float) -> float:
+def right_or_refused(rows: list[FamiliarityRow], kind: str, threshold: float) -> float:
     """Share of the questions of a kind answered right or below a threshold."""
     values = [row.right or row.familiarity < threshold for row in rows if row.kind == kind]
     return float(np.mean(values)) if values else float("nan")
 
 
-def area(rows: list[Asked]) -> float:
+def area(rows: list[FamiliarityRow]) -> float:
     """Area under the ROC curve: how often a question about own objects looks more familiar than one
     about foreign ones (Mann & Whitney 1947)."""
     own = np.array([row.familiarity for row in rows if row.kind == OWN])
@@ -88,7 +88,7 @@ def area(rows: list[Asked]) -> float:
     return float(((difference > 0) + 0.5 * (difference == 0)).mean())
 
 
-def table(split: str, rows: list[Asked], threshold: float) -> str:
+def familiarity_table(split: str, rows: list[FamiliarityRow], threshold: float) -> str:
     """What is refused, and what is answered wrong, of every kind of question, as text."""
     lines = [
         f"{split}: own objects look more familiar than foreign ones in {100 * area(rows):.1f} % of "
@@ -147,7 +147,7 @@ def run(arguments: argparse.Namespace, aligner: Aligner | None = None) -> int:
                 {"set": name, "area": area(rows), "questions": [asdict(row) for row in rows]}
             )
         else:
-            print(table(name, rows, arguments.threshold) + "\n", flush=True)
+            print(familiarity_table(name, rows, arguments.threshold) + "\n", flush=True)
     if arguments.json:
         print(json.dumps(document, indent=2))
     return 0

@@ -21,7 +21,7 @@ _FEWEST = 40  # points that two cameras have to share
 
 
 @dataclass(frozen=True)
-class CameraView:
+class DepthView:
     """What one camera measures, and from where."""
 
     depth: np.ndarray  # (H, W) m; not finite or 0 where there is none
@@ -77,7 +77,7 @@ _AROUND = tuple(
 )
 
 
-def disagreement(a: CameraView, b: CameraView) -> float:
+def disagreement(a: DepthView, b: DepthView) -> float:
     """Share of the points of one camera that float before another, in [0, 1]: the larger one of
     both directions, and of objects and scene; 0 where they share too little to tell."""
     worst = 0.0
@@ -89,7 +89,7 @@ def disagreement(a: CameraView, b: CameraView) -> float:
     return worst
 
 
-def disagreeing(views: Mapping[str, CameraView], limit: float) -> dict[str, dict[str, float]]:
+def disagreeing(views: Mapping[str, DepthView], limit: float) -> dict[str, dict[str, float]]:
     """The cameras whose poses don't fit the others': name -> the others that it disagrees with by
     more than `limit`, and by how much.
 

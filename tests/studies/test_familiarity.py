@@ -7,7 +7,14 @@ from scipy.stats import mannwhitneyu
 
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.errors import IgaDrakeError
-from iga_drake.studies.familiarity import Asked, area, refused, right_or_refused, run, table
+from iga_drake.studies.familiarity import (
+    FamiliarityRow,
+    area,
+    familiarity_table,
+    refused,
+    right_or_refused,
+    run,
+)
 
 
 class Given:
@@ -34,7 +41,7 @@ def test_own_foreign_and_disturbed_objects_are_asked_in_turn(capsys) -> None:
     assert run(_arguments(), Given(*answers)) == 0
     (found,) = json.loads(capsys.readouterr().out)
     assert found["area"] == pytest.approx(0.75)
-    rows = [Asked(**row) for row in found["questions"]]
+    rows = [FamiliarityRow(**row) for row in found["questions"]]
     kinds = ["own", "both", "half", "own", "grasped", "half"]
     assert [row.kind for row in rows] == kinds
     assert [row.familiarity for row in rows] == pytest.approx(answers)
@@ -46,20 +53,23 @@ def test_own_foreign_and_disturbed_objects_are_asked_in_turn(capsys) -> None:
 
 def test_shares_by_hand() -> None:
     rows = [
-        Asked(0, "own", 0.9, True), Asked(1, "own", 0.8, False), Asked(2, "own", 0.3, True),
-        Asked(3, "own", 0.5, True), Asked(0, "swapped", 0.4, False),
-    ]  # fmt: skip
+        FamiliarityRow(0, "own", 0.9, True),
+        FamiliarityRow(1, "own", 0.8, False),
+        FamiliarityRow(2, "own", 0.3, True),
+        FamiliarityRow(3, "own", 0.5, True),
+        FamiliarityRow(0, "swapped", 0.4, False),
+    ]
     assert refused(rows, "own", 0.5) == 0.25 and refused(rows, "swapped", 0.5) == 1
     assert right_or_refused(rows, "own", 0.5) == 0.75
     assert np.isnan(refused(rows, "half", 0.5)) and np.isnan(right_or_refused(rows, "half", 0.5))
-    assert "75.0 % of the comparisons" in table("set", rows, 0.5)
+    assert "75.0 % of the comparisons" in familiarity_table("set", rows, 0.5)
 
 
 def test_the_area_is_the_statistic_of_mann_and_whitney() -> None:
     rng = np.random.default_rng(0)
     own, foreign = rng.random(40).round(1) * 0.7 + 0.3, rng.random(30).round(1)
-    rows = [Asked(k, "own", v, True) for k, v in enumerate(own)]
-    rows += [Asked(k, "target", v, False) for k, v in enumerate(foreign)]
+    rows = [FamiliarityRow(k, "own", v, True) for k, v in enumerate(own)]
+    rows += [FamiliarityRow(k, "target", v, False) for k, v in enumerate(foreign)]
     assert area(rows) == pytest.approx(mannwhitneyu(own, foreign).statistic / (40 * 30))
 
 

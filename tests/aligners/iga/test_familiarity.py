@@ -78,6 +78,7 @@ def test_sizes_and_widths_are_ratios() -> None:
     assert float(strayed[MATCHES]) == pytest.approx(math.log(1.5), abs=0.02)
 
 
+@torch.no_grad()
 def test_the_regression_is_a_logistic_one() -> None:
     net = FamiliarityNet()
     assert float(net(torch.randn(len(FIGURES)))) == 0.5  # not fitted
