@@ -122,6 +122,7 @@ def test_replay(browser, tmp_path: Path):
     }  # fmt: skip
     page = tmp_path / "replay.html"
     page.write_text(replay_html(shown_run().meshcat, row), encoding="utf-8")
+    assert page.stat().st_size < 0.6 * len(shown_run().meshcat.StaticHtml())
     browser.open(page.as_uri() + "#t=0.1")
     browser.wait_for("typeof iga == 'object' && iga.ready()")
     words = browser.evaluate("document.body.innerText")
