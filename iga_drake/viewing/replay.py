@@ -1,5 +1,7 @@
 """Pictures of an episode and of demonstrations, in Meshcat and as pages that need no server."""
 
+import base64
+import gzip
 import importlib.resources
 import json
 from collections.abc import Mapping
@@ -99,9 +101,35 @@ def replay_html(meshcat: Meshcat, episode: Mapping[str, Any]) -> str:
     data = json.dumps({**episode, "legend": LEGEND}).replace("</", "<\\/")
     overlay = importlib.resources.files(__package__).joinpath("timeline.html").read_text("utf-8")
     head, body, rest = page.rpartition("</body>")
-    return (
-        f'{head}<script type="application/json" id="episode">{data}</script>\n{overlay}{body}{rest}'
-    )
+    data = f'<script type="application/json" id="episode">{data}</script>'
+    return packed_page("\n".join((head, data, overlay, body + rest)))
+
+
+def packed_page(page: str) -> str:
+    """A page that unpacks itself into `page` when it is opened, of about half its size."""
+    packed = base64.b64encode(gzip.compress(page.encode(), compresslevel=6, mtime=0)).decode()
+    return _UNPACKING.replace("PACKED", packed)
+
+
+_UNPACKING = """<!doctype html>
+<html><head><meta charset="utf-8"></head><body>
+<script type="text/plain" id="packed">PACKED</script>
+<script>
+(async () => {
+  if (typeof DecompressionStream === "undefined") {
+    document.body.textContent = "This page needs a browser of 2023 or newer.";
+    return;
+  }
+  const packed = atob(document.getElementById("packed").textContent);
+  const bytes = Uint8Array.from(packed, (letter) => letter.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const page = await new Response(stream).text();
+  document.open();
+  document.write(page);
+  document.close();
+})();
+</script></body></html>
+"""
 
 
 def show_demonstrations(

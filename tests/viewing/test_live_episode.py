@@ -51,7 +51,7 @@ def test_an_episode_is_looked_at_live_and_as_a_replay(tmp_path: Path):
         end_recording(meshcat)
     page = tmp_path / "stack.html"
     page.write_text(replay_html(meshcat, row), encoding="utf-8")
-    assert result.success and page.stat().st_size <= 6e6
+    assert result.success and page.stat().st_size <= 4e6
     with Browser(tmp_path / "replay", width=1280, height=720) as browser:
         browser.open(f"{page.as_uri()}#t={MOMENT}")
         browser.wait_for("typeof iga == 'object' && iga.ready()", 120.0)

@@ -122,6 +122,7 @@ def test_replay(browser, tmp_path: Path):
     }  # fmt: skip
     page = tmp_path / "replay.html"
     page.write_text(replay_html(shown_run().meshcat, row), encoding="utf-8")
+    assert page.stat().st_size < 0.6 * len(shown_run().meshcat.StaticHtml())
     browser.open(page.as_uri() + "#t=0.1")
     browser.wait_for("typeof iga == 'object' && iga.ready()")
     words = browser.evaluate("document.body.innerText")
@@ -135,8 +136,13 @@ def test_replay(browser, tmp_path: Path):
     for path in ("observed/pan", "predicted/grasp/modes", "predicted/grasp/chosen"):
         browser.wait_for(has_shape(path))
         assert browser.evaluate(is_visible(path)) is False, path
-    browser.evaluate(f"iga.seek({END - 0.1})")
+    browser.evaluate("iga.seek(2.0)")
     for path in ("observed/pan", "predicted/grasp/modes", "predicted/grasp/chosen"):
         assert browser.evaluate(is_visible(path)) is True, path
     assert "move grasp" in browser.evaluate("document.getElementById('iga-now').innerText")
+    # The other modes go when the waypoint is reached.
+    (reached,) = shown_run().status.times_reached
+    browser.evaluate(f"iga.seek({reached + 0.1})")
+    assert browser.evaluate(is_visible("predicted/grasp/modes")) is False
+    assert browser.evaluate(is_visible("predicted/grasp/chosen")) is True
     assert browser.errors == []

@@ -18,7 +18,7 @@ from iga_drake.viewing.replay import begin_recording, end_recording
 
 # Of the two modes that the stub's aligner answers with.
 ENERGIES, PROBABILITIES = (-2.5, -1.25), (0.75, 0.25)
-END = 4.0  # s, in the middle of the motion
+END = 4.0  # s, in the middle of the motion: the waypoint was just reached
 
 
 class TwoModes:
