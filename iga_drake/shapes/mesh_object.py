@@ -9,16 +9,11 @@ import trimesh
 from iga_drake.shapes.convex_pieces import convex_pieces, hull_of, joined
 from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.instance import MassProperties, ShapeInstance, frame
-from iga_drake.shapes.mesh_cleaning import MeshCleaning
-from iga_drake.shapes.readers import FORMATS, MeshEntry, read_mesh
+from iga_drake.shapes.mesh_cleaning import UP_AXES, MeshCleaning
+from iga_drake.shapes.readers import FORMATS, Y_UP_FORMATS, MeshEntry, read_mesh
 
 # Edge of the largest and the smallest box (m) that an object's bounds may be.
 LARGEST, SMALLEST = 2.0, 0.005
-UP_AXES = {
-    "x": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
-    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-    "z": np.eye(3),
-}
 _FACES = 20_000  # of the mesh that is drawn, at most
 
 
@@ -51,10 +46,15 @@ def read_mesh_object(path: Path, reading: MeshReading | None = None) -> ShapeIns
         raise ShapeError(f"{path}: no mesh of a known kind; use one of {', '.join(FORMATS)}")
     if reading.up not in ("", *UP_AXES):
         raise ShapeError(f"{path}: up: '{reading.up}' found, x, y or z expected")
-    up = reading.up or ("y" if path.suffix.lower() in (".gltf", ".glb") else "z")
-    entry = MeshEntry(name=path.stem, category=path.parent.name, path=path, source=str(path))
-    shape = read_mesh(entry, MeshCleaning(scale=reading.unit, centre=False))
-    vertices = shape.vertices @ UP_AXES[up].T
+    entry = MeshEntry(
+        name=path.stem,
+        category=path.parent.name,
+        path=path,
+        source=str(path),
+        y_up=path.suffix.lower() in Y_UP_FORMATS,
+    )
+    shape = read_mesh(entry, MeshCleaning(scale=reading.unit, up=reading.up, centre=False))
+    vertices = shape.vertices
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = " x ".join(f"{edge:.3g}" for edge in high - low)
     if not SMALLEST <= (high - low).max() <= LARGEST:

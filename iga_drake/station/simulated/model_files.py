@@ -41,7 +41,8 @@ from iga_drake.files import write_text
 from iga_drake.paths import cache_dir
 from iga_drake.shapes.convex_pieces import hull_of, joined
 from iga_drake.shapes.instance import MassProperties, ShapeInstance
-from iga_drake.shapes.mesh_object import LARGEST, UP_AXES
+from iga_drake.shapes.mesh_cleaning import UP_AXES
+from iga_drake.shapes.mesh_object import LARGEST
 from iga_drake.shapes.sdf import visual_obj
 from iga_drake.station.contract import StationError
 from iga_drake.station.simulated.scene import SceneObject
