@@ -4,7 +4,9 @@ import argparse
 
 from iga_drake.cli.subcommands import Subcommand, add_subcommands, run_subcommand
 
-SUBCOMMANDS = {"panda": Subcommand("iga_drake.cli.drive_panda")}
+SUBCOMMANDS = {
+    "panda": Subcommand("iga_drake.cli.drive_panda", "between LCM and a Panda or an FR3")
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -18,12 +18,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from iga_drake.drivers.panda import DriverLimits
 
     parser.add_argument("--ip", required=True, help="the arm's address")
-    parser.add_argument(
-        "--lcm-url", default="udpm://239.255.76.67:7667?ttl=0", help="bus (default %(default)s)"
-    )
+    parser.add_argument("--lcm-url", default="udpm://239.255.76.67:7667?ttl=0", help="bus")
     parser.add_argument(
         "--speed", type=float, default=0.2,
-        help="share of the arm's velocity, acceleration and jerk limits (default %(default)s)",
+        help="share of the arm's velocity, acceleration and jerk limits",
     )  # fmt: skip
     parser.add_argument("--no-hand", action="store_true", help="the arm alone")
     parser.add_argument("--no-homing", action="store_true", help="the hand was homed already")
@@ -34,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for field in fields(DriverLimits):
         parser.add_argument(
             f"--{field.name.replace('_', '-')}", type=type(field.default), default=field.default,
-            help="see DriverLimits in iga_drake/drivers/panda.py (default %(default)s)",
+            help="see DriverLimits in iga_drake/drivers/panda.py",
         )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from iga_drake.drivers.arm import ArmState, DriverError
-from iga_drake.errors import error_text
+from iga_drake.errors import error_text, missing_extra
 from iga_drake.systems.ports import ArmMode
 
 # Collision thresholds: N m at joints 1-4 and 5-7, N (N m) at the hand.
@@ -36,9 +36,7 @@ def connect_franka(ip: str) -> Any:
     try:
         import franka
     except ImportError as error:
-        raise DriverError(
-            "franka-rs is missing, which speaks to the arm: pip install 'iga-drake[franka]'"
-        ) from error
+        raise DriverError(missing_extra(error) or error_text(error)) from error
     try:
         return franka.Robot(ip)
     except franka.FrankaError as error:
