@@ -17,7 +17,9 @@ from iga_drake.station.scenario import (
     load_scenario,
 )
 
-SHIPPED = ("grasp", "stack", "hang", "insert", "pour", "sweep", "field", "one_of_everything")
+SHIPPED = (
+    "grasp", "stack", "hang", "insert", "pour", "sweep", "field", "one_of_everything", "ycb_fruit",
+)  # fmt: skip
 # Time steps (s) other than the default.
 TIME_STEPS = {"pour": 0.0025, "sweep": 0.005}
 
