@@ -131,6 +131,16 @@ class ShapeInstance:
         chosen = [self.part_names.index(name) for name in names]
         return self.vertices[np.unique(self.faces[np.isin(self.part_labels, chosen)])]
 
+    def part_pieces(self, *names: str) -> tuple[int, ...]:
+        """Indices of the convex pieces whose corners are all vertices of these parts. Raises
+        `ShapeError` where one isn't there."""
+        corners = {tuple(vertex) for vertex in self.part_vertices(*names).tolist()}
+        return tuple(
+            index
+            for index, piece in enumerate(self.convex_pieces)
+            if all(tuple(corner) in corners for corner in piece.tolist())
+        )
+
     def check_closed(self) -> None:
         """Raises `ShapeError` unless the faces close the solid and all look outwards."""
         self._require(self.mesh.is_watertight, "the mesh is not watertight")

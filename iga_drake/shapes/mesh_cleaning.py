@@ -102,10 +102,18 @@ def is_solid(mesh: trimesh.Trimesh) -> bool:
     return bool(mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0)
 
 
+def checked_vertices(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Positions (V, 3) of a mesh as read. Raises `MeshError` where they have other dimensions."""
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise MeshError(f"vertices of shape {vertices.shape}: three coordinates each expected")
+    return vertices
+
+
 def _checked(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """A copy with positions and faces alone, all finite."""
     faces = np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
-    vertices = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3)
+    vertices = checked_vertices(mesh)
     if len(faces) == 0:
         raise MeshError(f"no faces ({len(vertices)} vertices)")
     if faces.min() < 0 or faces.max() >= len(vertices):

@@ -27,7 +27,13 @@ import numpy as np
 import trimesh
 
 from iga_drake.shapes.errors import ShapeError
-from iga_drake.shapes.mesh_cleaning import MeshCleaning, MeshError, clean_mesh, is_solid
+from iga_drake.shapes.mesh_cleaning import (
+    MeshCleaning,
+    MeshError,
+    checked_vertices,
+    clean_mesh,
+    is_solid,
+)
 
 FORMATS = (".glb", ".gltf", ".obj", ".ply", ".stl")
 # glTF defines y as up; the other formats say nothing and are taken as they are.
@@ -339,7 +345,7 @@ def _load(path: Path) -> trimesh.Trimesh:
         raise MeshError(f"no faces: a point cloud, an empty scene{cut}")
     offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return trimesh.Trimesh(
-        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
+        vertices=np.concatenate([checked_vertices(mesh) for mesh in meshes]),
         faces=np.concatenate(
             [mesh.faces + start for mesh, start in zip(meshes, offsets, strict=True)]
         ),

@@ -7,17 +7,16 @@ import numpy as np
 from pydrake.geometry import Box, Meshcat, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant
-from pydrake.systems.framework import (
-    Diagram,
-    DiagramBuilder,
-)
-from pydrake.systems.primitives import MatrixGain
+from pydrake.symbolic import Expression, Variable
+from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort
+from pydrake.systems.lcm import LcmBuses
+from pydrake.systems.primitives import ConstantVectorSource, SymbolicVectorSystem
 
 from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
 from iga_drake.station.cameras.clutter import CameraClutter
 from iga_drake.station.cameras.rgbd import add_renderer, camera_info
 from iga_drake.station.contract import CHEAT, StationError
-from iga_drake.station.panda.command import PandaCommand
+from iga_drake.station.panda.driver import add_panda_ports
 from iga_drake.station.panda.model import PandaModel, Visuals, add_panda
 from iga_drake.station.scenario import Scenario, Table
 from iga_drake.station.simulated.model_files import (
@@ -27,7 +26,7 @@ from iga_drake.station.simulated.model_files import (
     names_the_world,
 )
 from iga_drake.station.simulated.scene import Scene
-from iga_drake.systems.ports import PANDA_JOINTS, Role
+from iga_drake.systems.ports import PANDA_JOINTS, ArmMode, Role
 from iga_drake.systems.segmentation import Segmentation
 from iga_drake.viewing.meshcat import add_visualizers
 
@@ -78,7 +77,7 @@ def build_simulation_station(
         source = f"object '{item.name}'" + (f" ({item.source})" if item.source else "")
         check_object(plant, scene_graph.model_inspector(), start, added[item.name], source)
 
-    _add_robot_ports(builder, plant, panda, scenario)
+    _add_robot_ports(builder, panda, scenario)
     add_renderer(scene_graph)
     for index, (name, camera) in enumerate(scenario.cameras.items()):
         ports = camera.add(
@@ -151,41 +150,27 @@ def _set_default_state(
             plant.SetDefaultFloatingBaseBodyPose(added[item.name].base, item.X_WO)
 
 
-def _add_robot_ports(
-    builder: DiagramBuilder, plant: MultibodyPlant, panda: PandaModel, scenario: Scenario
-) -> None:
-    """Connects the arm's and the hand's commands and measurements."""
-    instance = panda.instance
-    command = builder.AddNamedSystem(
-        "panda.command",
-        PandaCommand(scenario.panda, time_step=scenario.plant.time_step),
-    )
-    builder.Connect(
-        command.GetOutputPort("desired_state"), plant.get_desired_state_input_port(instance)
-    )
-    for name in ("panda.position", "hand.opening"):
-        builder.ExportInput(command.GetInputPort(name), name)
-
-    # Where the joints stand in the robot's own state (q, v) and generalized force.
-    nq, nv = plant.num_positions(instance), plant.num_velocities(instance)
-    of_q = list(plant.GetPositionsFromArray(instance, np.arange(plant.num_positions())))
-    of_v = list(plant.GetVelocitiesFromArray(instance, np.arange(plant.num_velocities())))
-    arm_q = [of_q.index(joint.position_start()) for joint in panda.arm_joints]
-    arm_v = [of_v.index(joint.velocity_start()) for joint in panda.arm_joints]
-    opening = np.zeros((1, nq + nv))
-    opening[0, [of_q.index(joint.position_start()) for joint in panda.finger_joints]] = 1.0
-
-    state = plant.get_state_output_port(instance)
-    torque = plant.get_generalized_contact_forces_output_port(instance)
-    for name, matrix, source in (
-        ("panda.position_measured", np.eye(nq + nv)[arm_q], state),
-        ("panda.velocity_measured", np.eye(nq + nv)[[nq + v for v in arm_v]], state),
-        ("panda.torque_external", np.eye(nv)[arm_v], torque),
-        ("hand.opening_measured", opening, state),
-    ):
-        gain = builder.AddNamedSystem(name, MatrixGain(matrix))
-        builder.Connect(source, gain.get_input_port())
-        builder.ExportOutput(gain.get_output_port(), name)
+def _add_robot_ports(builder: DiagramBuilder, panda: PandaModel, scenario: Scenario) -> None:
+    """Exports the arm's and the hand's commands and measurements."""
+    for name, driver in scenario.model_drivers.items():
+        url = scenario.lcm_buses[driver.lcm_bus].lcm_url
+        if url != LcmBuses.kLcmUrlMemqNull:
+            raise StationError(
+                f"model_drivers.{name}: the simulated station has ports, no LCM, but "
+                f"lcm_buses.{driver.lcm_bus}.lcm_url is '{url}': make it "
+                f"'{LcmBuses.kLcmUrlMemqNull}', or choose station 'hardware'"
+            )
+    for name, port in add_panda_ports(builder, panda, scenario.panda).items():
+        if isinstance(port, InputPort):
+            builder.ExportInput(port, name)
+        else:
+            builder.ExportOutput(port, name)
+    t = Variable("t")
+    now = builder.AddNamedSystem("time", SymbolicVectorSystem(time=t, output=[Expression(t)]))
+    for name in ("panda.time", "hand.time"):
+        builder.ExportOutput(now.get_output_port(), name)
+    mode = builder.AddNamedSystem("panda.mode", ConstantVectorSource([float(ArmMode.READY)]))
+    builder.ExportOutput(mode.get_output_port(), "panda.mode")
 
 
 def _add_cheat_ports(
