@@ -289,15 +289,18 @@ def test_poses_that_are_not_finite_are_refused():
 
 def test_objects_that_look_like_none_of_the_demonstrations_are_refused_where_asked():
     for familiarity, least, refused in (
-        (0.2, 0.0, False), (0.2, 0.5, True), (None, 0.5, False),
+        ((0.9, 0.2), 0.0, ""), ((0.9, 0.2), 0.5, "the target object looks like none"),
+        ((0.2, 0.9), 0.5, "the grasped object looks like none"), ((0.5, 0.5), 0.5, ""),
+        (None, 0.5, ""),
     ):  # fmt: skip
         aligner = FakeAligner(familiarity=familiarity)
         machine = make_machine(aligner=aligner, minimum_familiarity=least)
         memory, targets = run(machine, FakeInputs())
-        assert (memory.status.phase == Phase.REFUSED) == refused
+        assert (memory.status.phase == Phase.REFUSED) == bool(refused)
         if refused:
             assert memory.status.cause == "alignment" and list(targets) == [0]
-            assert f"familiarity {familiarity:.2f}, 0.5 is asked for" in memory.status.reason
+            assert refused in memory.status.reason and memory.status.reason.count("looks") == 1
+            assert "(familiarity 0.20); at least 0.5 is asked for" in memory.status.reason
 
 
 def test_unreachable_poses_are_refused():
