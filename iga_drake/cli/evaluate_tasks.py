@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from iga_drake.aligners.registry import EXPERT
+from iga_drake.aligners.registry import PRIVILEGED
 from iga_drake.cli.options import add_aligner_options, aligner_options, names, seed
 from iga_drake.cli.scenarios import (
     add_demonstrations_argument,
@@ -30,7 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_overlay_arguments(parser)
     add_demonstrations_argument(parser)
     parser.add_argument("--trials", type=int, default=15, help="of each scenario and aligner")
-    parser.add_argument("--aligner", type=names, default=["iga", "icp"], help="names, or expert")
+    parser.add_argument(
+        "--aligner", type=names, default=["iga", "icp"], help="names, expert or oracle"
+    )
     add_aligner_options(parser)
     parser.add_argument("--seed", type=seed, default=0, help="seed of the first trial")
     parser.add_argument(
@@ -143,7 +145,8 @@ def _trials(arguments: argparse.Namespace) -> "list[Trial]":
     from iga_drake.evaluation.task_success import Trial, trial_key
     from iga_drake.station.scenario import scenario_path
 
-    given = aligner_options(arguments, [name for name in arguments.aligner if name != EXPERT])
+    own = [name for name in arguments.aligner if name not in PRIVILEGED]
+    given = aligner_options(arguments, own)
     paths = [scenario_path(name) for name in arguments.tasks]
     changes = [f"--with={overlay}" for overlay in arguments.overlays]
     changes += [f"--set={override}" for override in arguments.overrides]
