@@ -16,7 +16,8 @@ from iga_drake.errors import missing_extra
 from iga_drake.station.scenario import load_scenario
 from iga_drake.tasks.registry import make_task
 
-PARTS = {"benchmark", "drive", "evaluate", "view"}  # verbs whose subcommands are modules of their own
+# Verbs whose subcommands are modules of their own.
+PARTS = {"benchmark", "drive", "evaluate", "view"}
 
 
 def parsers() -> list[CommandParser]:
