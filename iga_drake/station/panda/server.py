@@ -86,7 +86,7 @@ class PandaServer(LeafSystem):
         opening: float | None = None,
         clock: Clock = wall_clock,
     ) -> None:
-        """`opening` (m): what the hand was told before the first command, so that it goes on to hold
+        """`opening` (m): what the hand was told before the first command, so that it still holds
         what it holds; by default it rests where it is."""
         super().__init__()
         self.set_name("PandaServer")
