@@ -17,7 +17,7 @@ def _meshes(scene) -> dict[str, trimesh.Trimesh]:
     """The visual meshes of the scene's objects in W."""
     meshes = {}
     for item in scene.objects:
-        uri = item.sdf.split("<visual")[1].split("<uri>file://")[1].split("</uri>")[0]
+        uri = item.model.split("<visual")[1].split("<uri>file://")[1].split("</uri>")[0]
         mesh = trimesh.load_mesh(uri)
         meshes[item.name] = mesh.apply_transform(item.X_WO.GetAsMatrix4())
     return meshes
@@ -63,7 +63,7 @@ def test_families_of_the_task_are_left_out(tmp_path):
     assert "mug" in {shape.family for shape in scene.truth.shapes.values()}
     for seed in range(3):
         crowded = with_distractors(scene, 3, seed, mesh_folder=tmp_path)
-        folders = [item.sdf for item in crowded.objects[len(scene.objects) :]]
+        folders = [item.model for item in crowded.objects[len(scene.objects) :]]
         assert not any("/mug" in sdf for sdf in folders)
 
 
