@@ -50,9 +50,9 @@ def test_they_are_a_pure_function_of_the_seed(scene, tmp_path):
     first, again = (with_distractors(scene, 2, seed=5, mesh_folder=tmp_path) for _ in range(2))
     other = with_distractors(scene, 2, seed=6, mesh_folder=tmp_path)
     for one, two in zip(first.objects, again.objects, strict=True):
-        assert one.sdf == two.sdf
+        assert one.model == two.model
         assert one.X_WO.IsExactlyEqualTo(two.X_WO)
-    assert first.objects[-1].sdf != other.objects[-1].sdf
+    assert first.objects[-1].model != other.objects[-1].model
     assert with_distractors(scene, 0, seed=5) is scene
 
 
