@@ -45,6 +45,7 @@ _SHORT = _short()
 _EXTRAS = {
     "collada": "visuals",
     "fast_simplification": "meshes",
+    "franka": "franka",
     "igl": "dif-net",
     "joblib": "cluster",
     "manifold3d": "dif-net",

@@ -51,9 +51,8 @@ class Stub(LeafSystem):
             def vector(context) -> np.ndarray:
                 if port.name == "panda.position_measured":
                     return context.get_discrete_state_vector().value()
-                return (
-                    np.array([context.get_time() - self._age]) if kind == "time" else np.zeros(size)
-                )
+                age = 0.0 if name in ("panda", "hand") else self._age
+                return np.array([context.get_time() - age]) if kind == "time" else np.zeros(size)
 
             self.DeclareVectorOutputPort(
                 port.name, size,

@@ -15,7 +15,7 @@ PACKAGE = Path(iga_drake.__file__).parent
 # The packages in order of the data's way: each may import from itself and from those before it.
 ORDER = (
     "geometry", "shapes", "dataset", "demonstrations", "aligners", "training", "planning",
-    "systems", "policy", "viewing", "station", "tasks", "evaluation", "studies", "cli",
+    "systems", "policy", "viewing", "station", "drivers", "tasks", "evaluation", "studies", "cli",
 )  # fmt: skip
 # Usable by every package.
 ROOT_MODULES = {

@@ -19,6 +19,7 @@ HAND_OPENING_MAX = 0.08  # m, both fingers of the Franka Hand together
 Frame = Literal["E", "W"]
 ObservedRole = Literal["target", "grasped", "gripper"]
 FRAMES: tuple[Frame, ...] = get_args(Frame)
+_WHERE = {"E": "in the hand", "W": "where it stood"}
 OBSERVED_ROLES: tuple[ObservedRole, ...] = get_args(ObservedRole)
 
 
@@ -195,7 +196,8 @@ class Demonstration:
                 if found != frame:
                     raise DemonstrationError(
                         f"waypoint '{waypoint.name}': the {role} observation '{name}' is in frame "
-                        f"{found}, {frame} expected"
+                        f"{found}, {frame} expected: relate the one that was made of it "
+                        f"{_WHERE[frame]}"
                     )
                 used.add(name)
         unused = sorted(set(self.observations) - used)
@@ -250,6 +252,14 @@ class DemonstrationSet:
     def opening(self, waypoint: int) -> float:
         """Median opening of the hand (m) commanded once the waypoint is reached."""
         return float(np.median([d.waypoints[waypoint].opening for d in self.demonstrations]))
+
+    def turns(self, waypoint: int) -> np.ndarray:
+        """Rotations R_EE' (D, 3, 3) of the hand from the waypoint before to this one, which isn't
+        the first, one a demonstration."""
+        R_WE = np.stack(
+            [[w.X_WE[:3, :3] for w in d.waypoints[waypoint - 1 :][:2]] for d in self.demonstrations]
+        )
+        return np.swapaxes(R_WE[:, 0], 1, 2) @ R_WE[:, 1]
 
     @cached_property
     def contexts(self) -> tuple[tuple[Alignment, ...], ...]:

@@ -18,7 +18,9 @@ from typing import Any
 
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load, yaml_load_typed
+from pydrake.lcm import DrakeLcmParams
 from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.lcm import LcmBuses
 
 from iga_drake.errors import IgaDrakeError, check_bounds, check_range, error_text, shortened
 from iga_drake.paths import diagrams_dir
@@ -27,6 +29,10 @@ from iga_drake.policy.machine import PolicyConfig
 from iga_drake.station.cameras.clutter import Clutter
 from iga_drake.station.cameras.kinds import camera_type
 from iga_drake.station.cameras.rgbd import LookAt, RgbdCamera
+from iga_drake.station.declaration import TaskDeclaration
+from iga_drake.station.hardware.config import Hardware
+from iga_drake.station.panda.command import Panda
+from iga_drake.station.panda.driver import PandaDriver
 from iga_drake.systems.differential_ik import DifferentialIkConfig
 from iga_drake.systems.fusion import FusionConfig
 from iga_drake.systems.geometric_segmentation import SegmentationConfig
@@ -51,6 +57,10 @@ def _plant() -> MultibodyPlantConfig:
     )
 
 
+def _lcm_buses() -> dict[str, DrakeLcmParams]:
+    return {"default": DrakeLcmParams(lcm_url=LcmBuses.kLcmUrlMemqNull)}
+
+
 @dataclass
 class Table:
     """A box whose top is the plane z = 0 of W; the robot stands on it."""
@@ -73,25 +83,6 @@ class Table:
         check_bounds(self, where, bounds | {"color": (0.0, 1.0)})
 
 
-@dataclass
-class Panda:
-    """The robot in simulation."""
-
-    # Visual geometry: "primitives" (simple shapes), "meshes" (the published meshes, needs the extra
-    # `visuals`), or "auto": primitives for the cameras, so that perception is the same on every
-    # machine, and meshes for viewers where they can be had. Collisions are the same in all.
-    visuals: str = "auto"
-    # Time constant (s) with which a joint follows its command, and speed (m/s) of the opening.
-    time_constant: float = 0.01
-    opening_speed: float = 0.1
-
-    def check(self, where: str) -> None:
-        """Raises `ConfigError` for a value out of range."""
-        looks = ("auto", "meshes", "primitives")
-        check_range(self.visuals in looks, f"{where}.visuals", self.visuals, ", ".join(looks))
-        check_bounds(self, where, {"time_constant": (1e-4, 10.0), "opening_speed": (1e-3, 1.0)})
-
-
 def _cameras() -> dict[str, RgbdCamera]:
     return {
         "camera_0": RgbdCamera(pose=LookAt(position=[1.25, 0.0, 0.8], target=[0.5, 0.0, 0.18])),
@@ -104,10 +95,12 @@ def _cameras() -> dict[str, RgbdCamera]:
 class TaskChoice:
     """The task to do, by name, and its time limit."""
 
-    # Name in the task registry of `iga_drake.tasks`.
+    # Name in the task registry of `iga_drake.tasks`, or, with `declared`, a new one.
     name: str = "grasp"
     # Simulated time after which the episode has failed (s), > 0.
     time_limit: float = 120.0
+    # The task itself, where no registered one is meant.
+    declared: TaskDeclaration | None = None
 
 
 @dataclass
@@ -143,6 +136,12 @@ class Scenario:
     # Physics: time step (s), contact model and solver.
     plant: MultibodyPlantConfig = field(default_factory=_plant)
     panda: Panda = field(default_factory=Panda)
+    # Name -> LCM bus. "memq://null" is Drake's word for none: what would be sent are ports instead.
+    lcm_buses: dict[str, DrakeLcmParams] = field(default_factory=_lcm_buses)
+    # Name of the arm's model ("panda") -> its driver.
+    model_drivers: dict[str, PandaDriver] = field(default_factory=lambda: {"panda": PandaDriver()})
+    # The real cell; only the station `hardware` reads it.
+    hardware: Hardware = field(default_factory=Hardware)
     table: Table = field(default_factory=Table)
     # Name -> camera of any kind, at least one. A file that has this section states all cameras it
     # wants; what is no plain RGB-D camera has a tag, the name of its kind's class.
@@ -177,8 +176,12 @@ class Scenario:
 
     @property
     def digest(self) -> str:
-        """First 16 hexadecimal digits of the SHA-256 of `to_yaml()`; files' places don't matter."""
+        """First 16 hexadecimal digits of the SHA-256 of `to_yaml()`; files' places don't matter
+        and the content of the objects' files does."""
         said = dataclasses.replace(self, demonstrations=Path(self.demonstrations).name)
+        if self.task.declared is not None:
+            declared = self.task.declared.portable()
+            said = dataclasses.replace(said, task=dataclasses.replace(self.task, declared=declared))
         return hashlib.sha256(said.to_yaml().encode()).hexdigest()[:16]
 
     def to_yaml(self) -> str:
@@ -225,6 +228,9 @@ def load_scenario(
                 f"{file}: {size} bytes, a scenario has at most {_LARGEST_FILE}: is it another file?"
             )
         scenario = _layered(scenario, text, str(file))
+        declared = scenario.task.declared
+        if declared is not None and not Path(declared.folder).is_absolute():
+            declared.folder = str((file.resolve().parent / declared.folder).resolve())
         if _states(text, "demonstrations"):
             beside = _beside(file, scenario.demonstrations)
             scenario = dataclasses.replace(scenario, demonstrations=beside)
@@ -451,6 +457,13 @@ def _check_values(s: Scenario) -> None:
         check_range(value in valid, f"plant.{key}", value, ", ".join(valid))
     s.panda.check("panda")
     s.table.check("table")
+    good = list(s.model_drivers) == ["panda"]
+    check_range(good, "model_drivers", list(s.model_drivers), "one driver, that of 'panda'")
+    for name, driver in s.model_drivers.items():
+        driver.check(f"model_drivers.{name}")
+        _check_bus(s, f"model_drivers.{name}.lcm_bus", driver.lcm_bus)
+    _check_bus(s, "hardware.camera_bus", s.hardware.camera_bus)
+    s.hardware.check("hardware")
     check_range(0 < len(s.cameras) <= 32, "cameras", list(s.cameras), "1 to 32 cameras")
     for name in s.cameras:
         good = 0 < len(name) <= 64 and name.isprintable()
@@ -468,5 +481,11 @@ def _check_values(s: Scenario) -> None:
     s.policy.check("policy")
     s.visualization.check("visualization")
     check_bounds(s.task, "task", {"time_limit": (1e-3, 86_400.0)})
+    if s.task.declared is not None:
+        s.task.declared.check("task.declared")
     check_range(1 <= s.context_size <= 1000, "context_size", s.context_size, "1 to 1000")
     check_bounds(s.seeds, "seeds", dict.fromkeys(vars(s.seeds), (0, _MOST_SEED)))
+
+
+def _check_bus(s: Scenario, key: str, name: str) -> None:
+    check_range(name in s.lcm_buses, key, name, f"one of: {', '.join(s.lcm_buses)}")

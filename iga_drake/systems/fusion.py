@@ -14,6 +14,7 @@ from scipy.ndimage import binary_dilation
 
 from iga_drake.errors import IgaDrakeError, check_bounds, check_range, shortened
 from iga_drake.geometry.voxels import voxelize
+from iga_drake.systems.camera_agreement import DepthView, disagreeing
 from iga_drake.systems.ports import Role
 
 # Depths (m) that a camera in a robot's cell can measure.
@@ -44,6 +45,9 @@ class FusionConfig:
     maximum_age: float = 0.5
     # A camera that measures a depth in less than this share of its pixels counts as none.
     minimum_valid: float = 0.005
+    # A camera of whose points more than this share float where another camera sees through, or the
+    # other way round, counts as none: a pose is wrong (see `disagreeing`). 1: any pose will do.
+    maximum_disagreement: float = 0.05
 
     def check(self, where: str = "fusion") -> None:
         """Raises `ConfigError` for a value out of range."""
@@ -59,6 +63,7 @@ class FusionConfig:
                 "min_cluster": (1, 100_000),
                 "maximum_age": (1e-3, 3600.0),
                 "minimum_valid": (1e-6, 1.0),
+                "maximum_disagreement": (1e-6, 1.0),
             },
         )
         lower, upper = self.crop_lower, self.crop_upper
@@ -180,7 +185,8 @@ class PointCloudFusion(LeafSystem):
     crop box are dropped; the rest is unprojected into W, averaged by voxel, and specks are removed.
     Each camera is looked at by itself, and one with a problem gives no points: no image, an old one
     or one of the future, images of another size than the intrinsics', nearly no depth, depth in
-    other units, labels that are no roles, a pose that isn't rigid. All outputs come from one cached
+    other units, labels that are no roles, a pose that isn't rigid. Together they are looked at for
+    a pose that doesn't fit the others' (`camera_agreement.py`). All outputs come from one cached
     calculation and are pure functions of the inputs and of the time.
 
     .. pydrake_system::
@@ -219,6 +225,7 @@ class PointCloudFusion(LeafSystem):
         config.check("FusionConfig")
         self._lower = np.asarray(config.crop_lower, dtype=np.float32)
         self._upper = np.asarray(config.crop_upper, dtype=np.float32)
+        self._infos = dict(cameras)
         self._rays = {name: pixel_rays(info) for name, info in cameras.items()}
         self._inputs = {
             name: (
@@ -254,6 +261,7 @@ class PointCloudFusion(LeafSystem):
         parts: dict[int, list[np.ndarray]] = {Role.TARGET: [], Role.GRASPED: []}
         left = {role: _Left() for role in parts}
         counts = {}
+        images = {}
         for name, ports in self._inputs.items():
             depth, label, X_WC = (port.Eval(context) for port in ports)
             depth, label = depth.data[:, :, 0], label.data[:, :, 0]
@@ -263,8 +271,13 @@ class PointCloudFusion(LeafSystem):
                 or self._image_problem(name, depth, label, valid)
                 or pose_problem(X_WC)
             )
-            if problem:
-                counts[name] = CameraCounts(0, 0, 0, problem)
+            images[name] = depth, label, valid, X_WC
+            counts[name] = CameraCounts(0, 0, 0, problem)
+        sound = {name: image for name, image in images.items() if not counts[name].problem}
+        for name, problem in self._pose_conflicts(sound).items():
+            counts[name] = CameraCounts(0, 0, 0, problem)
+        for name, (depth, label, valid, X_WC) in images.items():
+            if counts[name].problem:
                 continue
             points, labels = self._unproject(name, depth, label, valid, X_WC, left)
             number = {}
@@ -289,6 +302,35 @@ class PointCloudFusion(LeafSystem):
             if left[role].labelled == 0:
                 losses[name] = unlabelled.get(name) or losses[name]
         value.set_value(FusedClouds(**fused, counts=counts, losses=losses))
+
+    def _pose_conflicts(
+        self,
+        images: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray, RigidTransform]],
+    ) -> dict[str, str]:
+        """Of cameras with images (depth, labels, which pixels are valid, X_WC), those whose pose
+        doesn't fit the others': why, in words."""
+        limit = self._config.maximum_disagreement
+        if limit >= 1 or len(images) < 2:
+            return {}
+        views = {
+            name: DepthView(
+                depth,
+                X_WC,
+                self._infos[name],
+                objects=valid & ((label == Role.TARGET) | (label == Role.GRASPED)),
+                scene=valid & (label != Role.ROBOT),
+            )
+            for name, (depth, label, valid, X_WC) in images.items()
+        }
+        return {
+            name: "measures what "
+            + " and ".join(
+                f"{other} sees through ({100 * share:.0f} % of it, or the other way round)"
+                for other, share in found.items()
+            )
+            + f"; {100 * limit:g} % are allowed: has it moved? Calibrate it again"
+            for name, found in disagreeing(views, limit).items()
+        }
 
     def _time_problem(self, name: str, context: Context) -> str:
         """Why this camera's images can't be of now, in words; empty if they can."""

@@ -15,6 +15,7 @@ class Cause(StrEnum):
     IK = "IK"  # the pose can't be reached, or the commanded motion breaks a limit
     CONTACT = "contact"  # something was touched, dropped or left in a wrong place
     TIME = "time"  # a time limit is over
+    ROBOT = "robot"  # the arm, its driver, or the link to them
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,40 @@ class Role(IntEnum):
     ROBOT = 3
 
 
+class ArmMode(IntEnum):
+    """Values of `panda.mode`: whether the arm follows commands, and if not, why."""
+
+    READY = 0
+    IDLE = 1
+    GUIDING = 2
+    REFLEX = 3
+    USER_STOPPED = 4
+    RECOVERING = 5
+    IGNORES_COMMANDS = 6
+    OTHER = 7
+
+    @property
+    def problem(self) -> str:
+        """What it means and what to do; empty if the arm follows commands."""
+        return _PROBLEMS[self]
+
+
+_PROBLEMS = {
+    ArmMode.READY: "",
+    ArmMode.IDLE: "the arm's driver doesn't control it: start the driver in the control mode that "
+    "the scenario states, not status_only",
+    ArmMode.GUIDING: "the arm is being guided by hand: let go of the guiding buttons",
+    ArmMode.REFLEX: "the arm stopped itself in a reflex: clear what it touches, then restart its "
+    "driver",
+    ArmMode.USER_STOPPED: "the arm is stopped by the user's switch: release it and restart the "
+    "arm's driver",
+    ArmMode.RECOVERING: "the arm recovers from an error: wait, then start anew",
+    ArmMode.IGNORES_COMMANDS: "the arm's driver doesn't follow the commands sent: look at its log; "
+    "commands expire where the two machines' clocks differ (chrony) or the link is slow",
+    ArmMode.OTHER: "the arm can't move: unlock its joints and activate its control interface",
+}
+
+
 @dataclass(frozen=True)
 class Port:
     """One port: its name, direction, value and unit."""
@@ -37,6 +71,10 @@ _FIXED = (
     Port("panda.velocity_measured", "output", "vector(7)", "rad/s"),
     Port("panda.torque_external", "output", "vector(7)", "N m"),
     Port("hand.opening_measured", "output", "vector(1)", "m"),
+    # When arm and hand were measured, on the diagram's clock.
+    Port("panda.time", "output", "vector(1)", "s"),
+    Port("hand.time", "output", "vector(1)", "s"),
+    Port("panda.mode", "output", "vector(1)", "ArmMode"),
 )
 
 

@@ -1,14 +1,23 @@
 """Supervisor: lets joint commands through while everything is within limits, else holds the arm."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    State,
+)
 
 from iga_drake.errors import check_bounds, check_range
 from iga_drake.planning.planning_robot import PlanningRobot
 from iga_drake.systems.messages import Cause, SupervisorStatus
+from iga_drake.systems.ports import ArmMode
 
 
 @dataclass
@@ -27,6 +36,15 @@ class SupervisorConfig:
         default_factory=lambda: [40.0, 40.0, 40.0, 40.0, 10.0, 10.0, 10.0]
     )
     torque_time: float = 0.05
+    # Share of the joints' acceleration limits that commands may have; null: not checked.
+    acceleration_scale: float | None = None
+    # Largest age (s) of the arm's and of the hand's measurements.
+    arm_age: float = 0.05
+    hand_age: float = 0.5
+    # Largest age (s) of a camera's last image while the arm moves; null: not checked.
+    camera_age: float | None = None
+    # How far (s) the diagram may lag behind the arm's clock while commands change.
+    lateness: float = 0.05
 
     def check(self, joints: int, where: str = "supervisor") -> None:
         """Raises `ConfigError` for a value out of range; the robot has this many joints."""
@@ -40,8 +58,14 @@ class SupervisorConfig:
                 "workspace_upper": (-3.0, 3.0),
                 "torque_limit": (1e-3, 1000.0),
                 "torque_time": (1e-3, 60.0),
+                "arm_age": (1e-3, 60.0),
+                "hand_age": (1e-3, 60.0),
+                "lateness": (1e-3, 60.0),
             },
         )
+        for name, bounds in (("acceleration_scale", (1e-3, 1.0)), ("camera_age", (1e-3, 60.0))):
+            if getattr(self, name) is not None:
+                check_bounds(self, where, {name: bounds})
         lower, upper = self.workspace_lower, self.workspace_upper
         ordered = len(lower) == len(upper) == 3 and all(
             low < up for low, up in zip(lower, upper, strict=True)
@@ -57,6 +81,7 @@ class _Memory:
     """The supervisor's abstract state: the last good command, overload and status."""
 
     position: np.ndarray | None = None  # last command that was good
+    velocity: np.ndarray | None = None  # of the last commands (rad/s)
     time_overloaded: float | None = None  # since when the torque is too high (s)
     status: SupervisorStatus = field(default_factory=SupervisorStatus)
 
@@ -76,23 +101,36 @@ class Supervisor(LeafSystem):
         - position_measured
         - velocity_measured
         - torque_external
+        - arm_time (optional)
+        - hand_time (optional)
+        - mode (optional)
+        - CAMERA.time for each camera
         output_ports:
         - position
         - status
 
     - `position_commanded` (N, rad), `position_measured` (N, rad), `velocity_measured` (N, rad/s),
       `torque_external` (N, N m).
+    - `arm_time`, `hand_time`, `CAMERA.time` (1, s): when arm and hand were measured and the images
+      taken, on the diagram's clock. `mode` (1): an `ArmMode`. What isn't connected isn't checked.
     - `position` (N, rad): the command let through. Before the first check it is the command itself
       if that is finite, else the measured position.
     - `status` (SupervisorStatus): whether it holds, and the reason.
 
-    Checked each time step: values that aren't finite; the command's joint limits, its change since
-    the last one and its distance to the measured angles; the measured velocity; the commanded
-    position of E against a box; external torque. Holding is latched: it ends with a new context.
+    Checked each time step: the arm's mode; the age of what is measured; values that aren't finite;
+    the command's joint limits, its change since the last one (velocity and acceleration) and its
+    distance to the measured angles; the measured velocity; the commanded position of E against a
+    box; external torque; and, while commands change, whether the diagram keeps up with the arm's
+    clock and the cameras deliver. Holding is latched: it ends with a new context.
     """
 
     def __init__(
-        self, robot: PlanningRobot, config: SupervisorConfig | None = None, *, period: float
+        self,
+        robot: PlanningRobot,
+        config: SupervisorConfig | None = None,
+        *,
+        period: float,
+        cameras: Sequence[str] = (),
     ) -> None:
         """`period` (s) of the checks: a command is at most this late. Raises `ConfigError`."""
         super().__init__()
@@ -106,6 +144,12 @@ class Supervisor(LeafSystem):
         self._position_input = self.DeclareVectorInputPort("position_measured", count)
         self._velocity_input = self.DeclareVectorInputPort("velocity_measured", count)
         self._torque_input = self.DeclareVectorInputPort("torque_external", count)
+        self._arm_time_input = self.DeclareVectorInputPort("arm_time", 1)
+        self._hand_time_input = self.DeclareVectorInputPort("hand_time", 1)
+        self._mode_input = self.DeclareVectorInputPort("mode", 1)
+        self._camera_inputs = {
+            name: self.DeclareVectorInputPort(f"{name}.time", 1) for name in cameras
+        }
         self._memory = self.DeclareAbstractState(Value[object](_Memory()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
         ticket = {self.abstract_state_ticket(self._memory)}
@@ -136,26 +180,68 @@ class Supervisor(LeafSystem):
             overloaded = memory.time_overloaded
             overloaded = context.get_time() if overloaded is None else overloaded
         last = self._first_position(context) if memory.position is None else memory.position
-        cause, reason = self._find_reason(
-            command=command,
-            last=last,
-            position=self._position_input.Eval(context),
-            velocity=self._velocity_input.Eval(context),
-            torque=torque,
-            overload_time=0.0 if overloaded is None else context.get_time() - overloaded,
-        )
+        velocity = (command - last) / self._period
+        cause, reason = self._find_robot_reason(context, moving=bool((command != last).any()))
+        if not reason:
+            cause, reason = self._find_reason(
+                command=command,
+                velocity_commanded=velocity,
+                velocity_before=memory.velocity,
+                position=self._position_input.Eval(context),
+                velocity=self._velocity_input.Eval(context),
+                torque=torque,
+                overload_time=0.0 if overloaded is None else context.get_time() - overloaded,
+            )
         if reason:
             memory = replace(memory, position=last, status=SupervisorStatus(True, reason, cause))
         else:
-            memory = replace(memory, position=command, time_overloaded=overloaded)
+            memory = replace(
+                memory, position=command, velocity=velocity, time_overloaded=overloaded
+            )
         state.get_mutable_abstract_state(int(self._memory)).set_value(memory)
         return EventStatus.Succeeded()
+
+    def _find_robot_reason(self, context: Context, *, moving: bool) -> tuple[Cause, str]:
+        """What is wrong with the arm, the link to it, or the cameras; empty if nothing is."""
+        config, now = self._config, context.get_time()
+        mode = self._read(context, self._mode_input)
+        if mode is not None and (problem := _mode(mode).problem):
+            return Cause.ROBOT, problem
+        for name, port, limit in (
+            ("arm", self._arm_time_input, config.arm_age),
+            ("hand", self._hand_time_input, config.hand_age),
+        ):
+            time = self._read(context, port)
+            if time is not None and not now - time <= limit:
+                return Cause.ROBOT, (
+                    f"the {name}'s last measurement is {now - time:.2f} s old, at most "
+                    f"{limit:g} s allowed: look at its driver and the link to it"
+                )
+            if time is not None and moving and time - now > config.lateness:
+                return Cause.ROBOT, (
+                    f"commands are late: the diagram lags {time - now:.2f} s behind the {name}'s "
+                    f"clock, at most {config.lateness:g} s allowed: free the processor, or set the "
+                    "machines' clocks (chrony)"
+                )
+        if config.camera_age is not None and moving:
+            for name, port in self._camera_inputs.items():
+                time = self._read(context, port)
+                if time is not None and not now - time <= config.camera_age:
+                    return Cause.PERCEPTION, (
+                        f"{name} delivered its last image {now - time:.2f} s ago, at most "
+                        f"{config.camera_age:g} s allowed: look at its driver and its cable"
+                    )
+        return Cause.IK, ""
+
+    def _read(self, context: Context, port: InputPort) -> float | None:
+        return float(port.Eval(context)[0]) if port.HasValue(context) else None
 
     def _find_reason(
         self,
         *,
         command: np.ndarray,
-        last: np.ndarray,
+        velocity_commanded: np.ndarray,
+        velocity_before: np.ndarray | None,
         position: np.ndarray,
         velocity: np.ndarray,
         torque: np.ndarray,
@@ -177,12 +263,17 @@ class Supervisor(LeafSystem):
             reason := _outside(
                 "commanded velocity",
                 "rad/s",
-                (command - last) / self._period,
+                velocity_commanded,
                 config.velocity_scale * limits.velocity_lower() * (1 + 1e-6),
                 config.velocity_scale * limits.velocity_upper() * (1 + 1e-6),
             )
         ):
             return Cause.IK, reason
+        if config.acceleration_scale is not None and velocity_before is not None:
+            bound = config.acceleration_scale * limits.acceleration_upper() * (1 + 1e-6)
+            acceleration = (velocity_commanded - velocity_before) / self._period
+            if reason := _outside("commanded acceleration", "rad/s^2", acceleration, -bound, bound):
+                return Cause.IK, reason
         if reason := _outside(
             "measured velocity",
             "rad/s",
@@ -217,6 +308,11 @@ class Supervisor(LeafSystem):
 
     def _calc_status(self, context: Context, output: AbstractValue) -> None:
         output.set_value(context.get_abstract_state(int(self._memory)).get_value().status)
+
+
+def _mode(value: float) -> ArmMode:
+    """`OTHER` for what is no mode."""
+    return ArmMode(int(value)) if value in {float(mode) for mode in ArmMode} else ArmMode.OTHER
 
 
 def _outside(name: str, unit: str, value: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> str:

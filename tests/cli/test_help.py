@@ -16,8 +16,6 @@ from iga_drake.errors import missing_extra
 from iga_drake.station.scenario import load_scenario
 from iga_drake.tasks.registry import make_task
 
-PARTS = {"benchmark", "evaluate", "view"}  # verbs whose subcommands are modules of their own
-
 
 def parsers() -> list[CommandParser]:
     """The parser of every verb and of every part of one."""
@@ -36,9 +34,8 @@ def parsers() -> list[CommandParser]:
         parser = CommandParser(prog=f"iga {verb}")
         module.add_arguments(parser)
         add(parser)
-        if verb in PARTS:
-            for what, chosen in module.SUBCOMMANDS.items():
-                add(subcommand_parser(verb, what, chosen))
+        for what, chosen in getattr(module, "SUBCOMMANDS", {}).items():  # modules of their own
+            add(subcommand_parser(verb, what, chosen))
     return found
 
 
@@ -112,3 +109,7 @@ def test_a_missing_extra_is_named_with_what_to_type(
     assert cli.main(arguments) == cli.BAD_INPUT
     assert "igl is not installed: pip install 'iga-drake[dif-net]'" in capsys.readouterr().err
     assert missing_extra(ImportError("broken", name="numpy")) == ""
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    for verb in (["simulate", "grasp"], ["evaluate", "tasks", "--tasks", "grasp"]):
+        assert cli.main([*verb, "--aligner", "icp"]) == cli.BAD_INPUT
+        assert "pip install 'iga-drake[icp]'" in capsys.readouterr().err

@@ -103,7 +103,7 @@ def test_a_station_and_a_camera_of_another_package(tmp_path: Path):
 
 def test_unknown_stations_are_listed():
     scenario = Scenario(station="moon")
-    with pytest.raises(StationError, match="unknown station 'moon': one of: simulated"):
+    with pytest.raises(StationError, match="unknown station 'moon': one of: hardware, re"):
         make_station(scenario)
 
 

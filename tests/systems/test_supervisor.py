@@ -4,6 +4,8 @@ from control_fixtures import downward, panda_robot, panda_solver
 from pydrake.systems.analysis import Simulator
 
 from iga_drake.errors import IgaDrakeError
+from iga_drake.systems.messages import Cause
+from iga_drake.systems.ports import ArmMode
 from iga_drake.systems.supervisor import Supervisor, SupervisorConfig
 
 STEP = 0.005
@@ -12,7 +14,7 @@ HOME = panda_robot().home
 
 class Run:
     def __init__(self, **config):
-        self.system = Supervisor(panda_robot(), SupervisorConfig(**config), period=0.005)
+        self.system = self.make(SupervisorConfig(**config))
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
         self.steps = 0
@@ -22,6 +24,9 @@ class Run:
             velocity_measured=np.zeros(7),
             torque_external=np.zeros(7),
         )
+
+    def make(self, config):
+        return Supervisor(panda_robot(), config, period=STEP)
 
     def set(self, **values):
         for name, value in values.items():
@@ -134,3 +139,80 @@ def test_contact_torque_holds_only_if_it_lasts():
 def test_wrong_number_of_torque_limits_is_refused():
     with pytest.raises(IgaDrakeError, match=r"torque_limit: .*7 numbers, one a joint"):
         Supervisor(panda_robot(), SupervisorConfig(torque_limit=[1.0]), period=0.005)
+
+
+class Watched(Run):
+    """With everything connected that tells of the arm, its link and a camera."""
+
+    def __init__(self, **config):
+        super().__init__(**config)
+        self.ages = {"arm_time": 0.0, "hand_time": 0.0, "left.time": 0.0}
+        self.set(mode=[0.0])
+
+    def make(self, config):
+        return Supervisor(panda_robot(), config, period=STEP, cameras=("left",))
+
+    def step(self, count=1):
+        for _ in range(count):
+            now = (self.steps + 0.5) * STEP
+            self.set(**{name: [now - STEP / 2 - age] for name, age in self.ages.items()})
+            super().step()
+
+
+def test_the_arms_mode_holds_the_arm():
+    for mode in ArmMode:
+        run = Watched()
+        run.step(2)
+        run.set(mode=[float(mode)])
+        run.step(2)
+        assert run.status.holding is (mode is not ArmMode.READY)
+        assert run.status.reason == mode.problem
+    for unknown in (99.0, -1.0, 0.5, np.nan):
+        run = Watched()
+        run.set(mode=[unknown])
+        run.step(2)
+        assert run.status.reason == ArmMode.OTHER.problem
+
+
+def test_old_measurements_hold_the_arm():
+    for name, age, holds in (
+        ("arm_time", 0.04, False), ("arm_time", 0.06, True), ("arm_time", np.nan, True),
+        ("hand_time", 0.4, False), ("hand_time", 0.6, True), ("left.time", 9.0, False),
+    ):  # fmt: skip
+        run = Watched()
+        run.step(2)
+        run.ages[name] = age
+        run.step(2)
+        assert run.status.holding is holds, (name, age)
+        if holds:
+            assert run.status.cause is Cause.ROBOT
+            assert f"the {name.partition('_')[0]}'s last measurement" in run.status.reason
+
+
+def test_a_lagging_diagram_and_a_lost_camera_hold_an_arm_that_moves():
+    for name, age, cause in (
+        ("arm_time", -0.1, Cause.ROBOT),
+        ("left.time", 2.0, Cause.PERCEPTION),
+        ("left.time", np.nan, Cause.PERCEPTION),
+    ):
+        run = Watched(camera_age=1.0)
+        run.step(2)
+        run.ages[name] = age
+        run.step(5)
+        assert not run.status.holding, run.status
+        run.set(position_commanded=HOME + 0.001)
+        run.step(2)
+        assert run.status.holding and run.status.cause is cause
+        np.testing.assert_allclose(run.position, HOME)
+
+
+def test_acceleration_is_limited_where_it_is_asked_for():
+    # Joint 2 may change its velocity by 7.5 rad/s^2: 0.0375 rad/s within a step.
+    for scale, change_of_velocity, holds in ((1.0, 0.036, False), (1.0, 0.04, True),
+                                             (0.5, 0.02, True), (None, 1.0, False)):  # fmt: skip
+        run = Run(acceleration_scale=scale)
+        run.step(2)
+        run.set(position_commanded=HOME + change(2, change_of_velocity * STEP))
+        run.step()
+        assert run.status.holding is holds, (scale, change_of_velocity)
+    assert run.status.reason == ""

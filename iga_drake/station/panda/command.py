@@ -1,15 +1,35 @@
 """From the port contract's commands to the desired state of the Panda's actuators."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
-from iga_drake.station.scenario import Panda
+from iga_drake.errors import check_bounds, check_range
 from iga_drake.systems.ports import PANDA_JOINTS
 
 _ACTUATORS = PANDA_JOINTS + 2
+
+
+@dataclass
+class Panda:
+    """The robot in simulation."""
+
+    # Visual geometry: "primitives" (simple shapes), "meshes" (the published meshes, needs the extra
+    # `visuals`), or "auto": primitives for the cameras, so that perception is the same on every
+    # machine, and meshes for viewers where they can be had. Collisions are the same in all.
+    visuals: str = "auto"
+    # Time constant (s) with which a joint follows its command, and speed (m/s) of the opening.
+    time_constant: float = 0.01
+    opening_speed: float = 0.1
+
+    def check(self, where: str) -> None:
+        """Raises `ConfigError` for a value out of range."""
+        looks = ("auto", "meshes", "primitives")
+        check_range(self.visuals in looks, f"{where}.visuals", self.visuals, ", ".join(looks))
+        check_bounds(self, where, {"time_constant": (1e-4, 10.0), "opening_speed": (1e-3, 1.0)})
 
 
 class PandaCommand(LeafSystem):
