@@ -86,10 +86,12 @@ class OracleInference:
         shapes = self._scene.truth.shapes
         X_WO = dict(now.X_WO)
         grasped, cloud_W = self._clouds
-        target = self._scene.with_role("target")[0].name
-        X_WO[target] = seen_pose(cloud_W, shapes[target], X_WO[target])
         motion = self._task.motion.waypoints[self._waypoint]
         roles = {plan.name: plan.role for plan in self._task.motion.observations}
+        # What stands still: the target, or what the hand is about to grasp.
+        role = "grasped" if roles[motion.target] == "grasped" else "target"
+        target = self._scene.with_role(role)[0].name
+        X_WO[target] = seen_pose(cloud_W, shapes[target], X_WO[target])
         if roles[motion.grasped] == "grasped":
             held = self._scene.with_role("grasped")[0].name
             X_EO = now.X_WE.inverse() @ X_WO[held]
