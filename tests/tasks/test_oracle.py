@@ -8,6 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from iga_drake.shapes.families import FAMILIES
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.tasks.oracle import OracleInference, seen_pose
+from iga_drake.tasks.pick_and_insert import PickAndInsert
 from iga_drake.tasks.snapshots import Snapshot
 from iga_drake.tasks.sweep import HELD, TARGET, Sweep
 
@@ -81,3 +82,18 @@ def test_the_oracle_answers_with_the_expert_s_pose_for_what_is_seen(tmp_path) ->
         assert position < 4.0 and rotation < 1.0
         unseen = task.expert(scene, X_W, X_WE)[waypoint]
         assert _distance(unseen, expected)[0] > 2 * position
+
+
+def test_the_oracle_grasps_what_it_sees_standing_on_the_table(tmp_path) -> None:
+    task = PickAndInsert()
+    scene = task.scene(2, mesh_folder=tmp_path)
+    X_W = {item.name: item.X_WO for item in scene.objects}
+    X_WE = RigidTransform(RollPitchYaw(np.pi, 0, 0), [0.3, 0.0, 0.5])
+    oracle = OracleInference(task, scene, lambda: Snapshot(0.0, X_W, X_WE, 0.08))
+    aside = RigidTransform([0.006, -0.004, 0.0])
+    cloud = _cloud(scene.truth.shapes[HELD], aside @ X_W[HELD])
+    question = oracle.start(0, np.zeros((0, 3)), cloud, 0)
+    (pose,) = oracle.poll(question, 1.0).estimate.poses
+    expected = aside @ task.expert(scene, X_W, X_WE)[0]
+    # A tilt of 0.5 degrees is 2 mm at the bottle's top.
+    assert np.linalg.norm(pose[:3, 3] - expected.translation()) < 0.003
