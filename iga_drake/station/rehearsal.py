@@ -76,6 +76,8 @@ def make_rehearsal_station(
         lcm,
         control_mode=cast(ControlMode, driver.control_mode),
         expiry=driver.expiry,
+        # What is held at the start was grasped before, and is still.
+        opening=0.0 if scene.truth.X_EO else scene.hand_opening,
         clock=_rehearsal_clock,
     )
     add_panda_server(builder, server, lcm)

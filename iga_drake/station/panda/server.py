@@ -83,8 +83,11 @@ class PandaServer(LeafSystem):
         control_mode: ControlMode = "position",
         expiry: float = 0.05,
         status_period: float = 0.005,
+        opening: float | None = None,
         clock: Clock = wall_clock,
     ) -> None:
+        """`opening` (m): what the hand was told before the first command, so that it still holds
+        what it holds; by default it rests where it is."""
         super().__init__()
         self.set_name("PandaServer")
         self.robot_mode: ArmMode | None = None
@@ -98,7 +101,7 @@ class PandaServer(LeafSystem):
         self._velocity_input = self.DeclareVectorInputPort("panda.velocity_measured", PANDA_JOINTS)
         self._torque_input = self.DeclareVectorInputPort("panda.torque_external", PANDA_JOINTS)
         self._opening_input = self.DeclareVectorInputPort("hand.opening_measured", 1)
-        self._state = self.DeclareAbstractState(Value[object](_Server()))
+        self._state = self.DeclareAbstractState(Value[object](_Server(opening=opening)))
         self.DeclarePeriodicUnrestrictedUpdateEvent(status_period, 0.0, self._update)
         self.DeclarePeriodicPublishEvent(status_period, 0.0, self._publish_arm)
         self.DeclarePeriodicPublishEvent(_HAND_PERIOD, 0.0, self._publish_hand)
