@@ -16,7 +16,7 @@ TEST_EXTRAS := $(DEMO_EXTRAS),icp,notebook,meshes,cluster,train,dif-net,geometri
 DEMO_PACKAGES := libglib2.0-0 libgl1 libegl1 libgl1-mesa-dri libgomp1 python3-venv
 TEST_PACKAGES := $(DEMO_PACKAGES) libusb-1.0-0
 
-.PHONY: help setup demo develop check test docs check-debian13 clean
+.PHONY: help setup demo develop check test docs fuzz check-debian13 clean
 .DEFAULT_GOAL := help
 
 help:
@@ -24,6 +24,7 @@ help:
 	@echo "make setup           sets up what the demo needs, and no more"
 	@echo "make test            sets up all extras, checks style and types, runs all tests"
 	@echo "make check           style and types alone"
+	@echo "make fuzz            runs the property tests on $(FUZZ_INPUTS) inputs each"
 	@echo "make docs            builds the documentation as a site"
 	@echo "make check-debian13  runs 'make demo' and 'make test' in a bare Debian 13 (as root)"
 	@echo "make clean           removes $(VENV) and outputs"
@@ -49,8 +50,14 @@ docs: develop
 	$(BIN)/python -m mkdocs build --quiet --strict --config-file .ci/mkdocs.yml --site-dir $(CURDIR)/outputs/site
 	@echo "outputs/site/index.html"
 
-test: check docs
+test: check docs $(VENV)/.browser
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --nbmake tests notebooks
+
+# Many more inputs for the property tests; FUZZ_INPUTS of each, which follow from FUZZ_SEED.
+FUZZ_INPUTS ?= 2000
+FUZZ_SEED ?= 0
+fuzz: develop
+	OMP_NUM_THREADS=1 FUZZ_INPUTS=$(FUZZ_INPUTS) $(BIN)/pytest -n auto -m hypothesis --hypothesis-seed=$(FUZZ_SEED) --hypothesis-show-statistics tests
 
 check-debian13:
 	.ci/check-debian13
@@ -97,3 +104,14 @@ $(VENV)/.test: pyproject.toml Makefile .ci/set_up.py | $(BIN)/python
 	$(call system_packages,$(TEST_PACKAGES))
 	$(call install_extras,$(TEST_EXTRAS))
 	@touch $(VENV)/.demo $@
+
+# Pages are tested in headless Chromium; where it is missing and can't be installed, these tests are
+# left out.
+$(VENV)/.browser: | $(BIN)/python
+	@if ! command -v chromium >/dev/null 2>&1 && ! command -v chromium-browser >/dev/null 2>&1; then \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null 2>&1; then \
+	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium; \
+	  else \
+	    echo "no chromium: tests of pages are left out; sudo apt-get install chromium" >&2; exit 0; \
+	  fi; \
+	fi; touch $@

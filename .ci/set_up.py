@@ -20,6 +20,15 @@ from pip._vendor.packaging.requirements import Requirement
 TORCH_SIZES = {"cpu": (200, 890), "cuda": (2700, 4700)}
 BASE_SIZE = (140, 580)
 EXTRA_SIZES = {
+    "cluster": (80, 250),
+    "dev": (110, 520),
+    "dif-net": (10, 20),
+    "docs": (10, 30),
+    "geometric": (5, 25),
+    "icp": (130, 430),
+    "meshes": (35, 65),
+    "notebook": (10, 90),
+    "train": (20, 55),
     "visuals": (140, 440),
 }
 # Packages that only CUDA builds of PyTorch require.

@@ -49,7 +49,8 @@ def test_it_simulates_in_an_empty_folder(wheel: Path, tmp_path: Path) -> None:
 
     version = iga("--version")
     assert version.returncode == 0 and wheel.name.split("-")[1] in version.stdout
-    short = iga("simulate", "grasp", "--seed", "3", "--set", "task.time_limit=0.6")
+    limits = ("--set", "task.time_limit=0.6", "--set", "policy.infer_limit=600")
+    short = iga("simulate", "grasp", "--seed", "3", *limits)
     assert short.returncode == 1, short.stderr
     assert "move grasp" in short.stdout and "time" in short.stdout
     where = [sys.executable, "-c", "import iga_drake.paths as p; print(p.models_dir())"]

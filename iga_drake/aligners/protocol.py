@@ -38,9 +38,9 @@ class PoseEstimate:
     poses: np.ndarray  # (M, 4, 4) float64
     energies: np.ndarray  # (M,) ascending
     probabilities: np.ndarray  # (M,) sums to 1
-    # Probability that the demonstrations show these objects; calibrated on contexts of other
-    # objects. None where the aligner can't tell.
-    familiarity: float | None = None
+    # (2,) how sure it is that the demonstrations show objects like the grasped one and the target,
+    # from 0 to 1; one half or more counts as known. None where the aligner can't tell.
+    familiarity: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         poses = self._numbers("poses")
@@ -74,12 +74,12 @@ class PoseEstimate:
         object.__setattr__(self, "poses", poses)
         if self.familiarity is not None:
             familiarity = self._numbers("familiarity")
-            if familiarity.shape != () or not 0 <= familiarity <= 1:
+            if familiarity.shape != (2,) or not ((familiarity >= 0) & (familiarity <= 1)).all():
                 raise AlignerError(
-                    f"PoseEstimate.familiarity: {shortened(self.familiarity)}, a number from 0 to "
-                    "1, or None, expected"
+                    f"PoseEstimate.familiarity: {shortened(self.familiarity)}, two numbers from 0 "
+                    "to 1 (of the grasped object and of the target), or None, expected"
                 )
-            object.__setattr__(self, "familiarity", float(familiarity))
+            object.__setattr__(self, "familiarity", familiarity)
 
     def _numbers(self, name: str) -> np.ndarray:
         """The field as float64."""

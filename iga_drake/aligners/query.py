@@ -1,10 +1,13 @@
 """The question that an aligner is measured by: aligned pairs, the last of them taken apart."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from iga_drake.aligners.protocol import Aligner, PoseEstimate
+from iga_drake.dataset.alignment_error import random_pose
+from iga_drake.dataset.field_versions import field_clouds
+from iga_drake.dataset.samples import Sample
 from iga_drake.demonstrations.alignment import Alignment
 
 
@@ -70,3 +73,29 @@ class Query:
     def motion(self, estimate: PoseEstimate) -> np.ndarray:
         """(4, 4) by which the best pose is off, of a cloud in its place: none where it is right."""
         return estimate.poses[0] @ self.start
+
+
+def sample_query(
+    sample: Sample, split: str, index: int, *, up: bool = False, field: str = ""
+) -> Query:
+    """The query about sample `index` of a set that every aligner gets.
+
+    Args:
+      sample: the sample itself.
+      split: the name of its set.
+      index: of the sample.
+      up: give the directions that are up, of the objects that have one.
+      field: disturb the clouds in this way, one of FIELD_KINDS; none: clean clouds.
+    """
+    A, B = (each if up and each.any(1).all() else None for each in sample.up.astype(np.float64))
+    start = random_pose(index)
+    query = Query.of(sample.points, start, grasped_up=A, target_up=B)
+    if not field:
+        return query
+    clouds_A, clouds_B = field_clouds(sample, field, split, index)
+    context = tuple(
+        replace(shown, grasped=clouds_A[n], target=clouds_B[n])
+        for n, shown in enumerate(query.context)
+    )
+    grasped = clouds_A[-1] @ start[:3, :3].T + start[:3, 3]
+    return replace(query, context=context, grasped=grasped, target=clouds_B[-1])

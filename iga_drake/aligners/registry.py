@@ -10,9 +10,10 @@ from iga_drake.aligners.protocol import Aligner, AlignerError, check_aligns
 from iga_drake.errors import error_text, shortened
 from iga_drake.registry import Registry
 
-# Names that stand beside aligners and that no aligner may take: the scripted expert of episodes,
-# which sees the true state, and the oracle of generated samples, which knows their surfaces.
+# Names that stand beside aligners and that no aligner may take: the scripted expert, which sees the
+# true state, and the oracle, which sees clouds and knows the true surfaces behind them.
 EXPERT, ORACLE = "expert", "oracle"
+PRIVILEGED = (EXPERT, ORACLE)
 
 _REGISTRY: Registry[Aligner] = Registry(
     "aligner",
@@ -20,7 +21,7 @@ _REGISTRY: Registry[Aligner] = Registry(
     attribute="ALIGNERS",
     group="iga_drake.aligners",
     error=AlignerError,
-    reserved=(EXPERT, ORACLE),
+    reserved=PRIVILEGED,
 )
 
 

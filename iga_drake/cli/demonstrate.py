@@ -28,13 +28,13 @@ def run(arguments: argparse.Namespace) -> int:
     from iga_drake.demonstrations.recording import Recording
     from iga_drake.demonstrations.store import MANIFEST, check_replaceable, write_demonstrations
     from iga_drake.tasks.episode import record_demonstrations
-    from iga_drake.tasks.registry import make_task
+    from iga_drake.tasks.registry import scenario_task
     from iga_drake.version import code_version
 
     if not 1 <= arguments.count <= MOST:
         raise CommandError(f"--count {arguments.count}: 1 to {MOST} demonstrations")
     scenario = scenario_of(arguments)
-    task = make_task(scenario.task.name).name
+    task = scenario_task(scenario).name
     check_replaceable(arguments.out)  # before minutes of recording
     if (arguments.out / MANIFEST).exists() and not arguments.overwrite:
         raise CommandError(

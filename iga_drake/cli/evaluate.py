@@ -34,6 +34,9 @@ SUBCOMMANDS = {
         "iga_drake.studies.scaling", "time and memory by number of demonstrations",
         "add_evaluate_scaling", "evaluate_scaling",
     ),
+    "segmentation": Subcommand(
+        "iga_drake.studies.segmentation", "the geometric segmenter's labels beside the true ones"
+    ),
     "stabilisers": Subcommand(
         "iga_drake.studies.stabilisers", "what stabilisers do to the paper's energy",
         "add_stabilisers", "evaluate_stabilisers",

@@ -3,12 +3,12 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from iga_drake.aligners.registry import EXPERT
+from iga_drake.aligners.registry import PRIVILEGED
 from iga_drake.cli.options import add_aligner_options, aligner_options, names, seed
 from iga_drake.cli.scenarios import (
     add_demonstrations_argument,
@@ -30,7 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_overlay_arguments(parser)
     add_demonstrations_argument(parser)
     parser.add_argument("--trials", type=int, default=15, help="of each scenario and aligner")
-    parser.add_argument("--aligner", type=names, default=["iga", "icp"], help="names, or expert")
+    parser.add_argument(
+        "--aligner", type=names, default=["iga", "icp"], help="names, expert or oracle"
+    )
     add_aligner_options(parser)
     parser.add_argument("--seed", type=seed, default=0, help="seed of the first trial")
     parser.add_argument(
@@ -90,7 +92,8 @@ def run(arguments: argparse.Namespace) -> int:
     before = read_trials(arguments.compare) if arguments.compare else None
     store = ResultsStore(arguments.results) if arguments.results else None
     trials = _trials(arguments)
-    one, width = run_trial, 1
+    one: Callable[[Trial], TrialResult] = run_trial
+    width = 1
     if arguments.ray is not None:
         one, width = on_cluster(arguments.ray or None)
     shown = counter("trials", len(trials))
@@ -115,7 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
     summary = summarise_trials(results)
     comparison = None if before is None else compare_trials(before, results)
     if arguments.json:
-        document = {"summary": summary, "trials": [asdict(r) for r in results]}
+        document: dict[str, Any] = {"summary": summary, "trials": [asdict(r) for r in results]}
         if comparison is not None:
             document["comparison"] = asdict(comparison) | {"probability": comparison.probability}
         print(json.dumps(document, indent=2))
@@ -142,7 +145,8 @@ def _trials(arguments: argparse.Namespace) -> "list[Trial]":
     from iga_drake.evaluation.task_success import Trial, trial_key
     from iga_drake.station.scenario import scenario_path
 
-    given = aligner_options(arguments, [name for name in arguments.aligner if name != EXPERT])
+    own = [name for name in arguments.aligner if name not in PRIVILEGED]
+    given = aligner_options(arguments, own)
     paths = [scenario_path(name) for name in arguments.tasks]
     changes = [f"--with={overlay}" for overlay in arguments.overlays]
     changes += [f"--set={override}" for override in arguments.overrides]

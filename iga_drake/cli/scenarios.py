@@ -56,22 +56,24 @@ def scenario_of(arguments: argparse.Namespace, scenario: str | None = None) -> "
 
 
 def with_aligner(scenario: "Scenario", name: str, options: Mapping[str, Any]) -> "Scenario":
-    """The scenario with the aligner `name`, or the expert, and these options; the scenario's own
-    stay where it is the scenario's aligner.
+    """The scenario with the aligner `name`, the expert or the oracle, and these options; the
+    scenario's own stay where it is the scenario's aligner.
 
     Raises `AlignerError` and `CommandError`.
     """
-    from iga_drake.aligners.registry import EXPERT, check_aligner, make_aligner
+    from iga_drake.aligners.registry import PRIVILEGED, check_aligner, make_aligner
 
-    if name != EXPERT:
+    if name not in PRIVILEGED:
         check_aligner(name)
     elif options:
-        raise CommandError(f"--option: the {EXPERT} takes none; leave it out")
+        raise CommandError(f"--option: the {name} takes none; leave it out")
     for option, value in options.items():
         if isinstance(value, bool) or not isinstance(value, (int, float, str)):
             raise CommandError(f"--option {option}={value}: a number or text is expected")
     own = scenario.aligner.options if name == scenario.aligner.name else {}
-    if options:  # whether it takes them, before minutes of simulation
+    if (
+        name not in PRIVILEGED
+    ):  # whether it takes them and all it needs is there, before the simulation
         make_aligner(name, **{**own, **options})
     chosen = dataclasses.replace(scenario.aligner, name=name, options={**own, **options})
     return dataclasses.replace(scenario, aligner=chosen)

@@ -7,6 +7,8 @@ from typing import Any
 
 from iga_drake.shapes.errors import ShapeError
 
+_LARGE = 10.0  # m, more than anything on a table has
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga shapes`."""
@@ -25,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--category", action="append", help="of ShapeNetCore.v2 alone; may be repeated"
     )
     read.add_argument("--scale", type=float, default=1.0, help="metres per unit (default 1)")
+    read.add_argument("--up", choices=("x", "y", "z"), help="axis of the files that points up")
     read.add_argument("--extent", type=float, metavar="M", help="scale each to this extent")
     read.add_argument("--faces", type=int, help="decimate to this many faces")
     read.add_argument("--count", type=int, help="read the first ones only")
@@ -121,7 +124,12 @@ def _read(arguments: argparse.Namespace) -> int:
 
     if arguments.count is not None and arguments.count < 1:
         raise ShapeError(f"--count {arguments.count}: at least 1 is needed")
-    cleaning = MeshCleaning(scale=arguments.scale, extent=arguments.extent, faces=arguments.faces)
+    cleaning = MeshCleaning(
+        scale=arguments.scale,
+        extent=arguments.extent,
+        up=arguments.up or "",
+        faces=arguments.faces,
+    )
     if arguments.category:
         if arguments.source in PACKAGES:
             raise ShapeError("--category: a package has none to choose; leave it out")
@@ -130,10 +138,12 @@ def _read(arguments: argparse.Namespace) -> int:
         entries = list_collection(arguments.source)
     report = ReadReport()
     for shape in read_meshes(entries[: arguments.count], cleaning=cleaning, report=report):
-        size = " x ".join(f"{extent:.4g}" for extent in np.ptp(shape.vertices, axis=0))
+        extents = np.ptp(shape.vertices, axis=0)
+        size = " x ".join(f"{extent:.4g}" for extent in extents)
         print(
             f"{shape.key}: {len(shape.vertices)} vertices, {len(shape.faces)} faces, {size} m, "
             f"{'watertight' if shape.watertight else 'open'}, {split_of(shape.key)}"
+            + (" (is it in millimetres? --scale 0.001)" if extents.max() > _LARGE else "")
         )
     print(report)
     return 0 if report.read else 1

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from iga_drake.cli import train_dif_net, train_encoder, train_paper
+from iga_drake.cli import train_dif_net, train_encoder, train_familiarity, train_paper
 from iga_drake.training.descriptor import DescriptorSettings, train_descriptor
 from iga_drake.training.energy import EnergySettings, train_energy
 from iga_drake.training.options import add_run_options, run_options, with_options
@@ -21,6 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     networks = parser.add_subparsers(dest="network", required=True, help="what to train")
     _add_descriptor(networks.add_parser("descriptor", help="dense descriptors of the iga aligner"))
     _add_energy(networks.add_parser("energy", help="energy of the iga aligner: ranks poses"))
+    train_familiarity.add_arguments(
+        networks.add_parser("familiarity", help="which objects the iga aligner takes for known")
+    )
     train_encoder.add_arguments(networks.add_parser("encoder", help="local encoder, by occupancy"))
     train_paper.add_arguments(networks.add_parser("paper", help="the paper's networks"))
     train_dif_net.add_arguments(networks.add_parser("dif-net", help="deformed implicit field"))
@@ -73,6 +76,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.network == "encoder":
         return train_encoder.run(arguments)
     torch.set_flush_denormal(True)
+    if arguments.network == "familiarity":
+        return train_familiarity.run(arguments)
     if arguments.network == "dif-net":
         return train_dif_net.run(arguments)
     if arguments.network == "paper":

@@ -77,8 +77,8 @@ def visible(points: Tensor, normals: Tensor, cameras: Tensor, *, spacing: Tensor
     """Tells which surface samples every camera sees: (S, K, O, P) bool.
 
     Args:
-      points, normals: (S, O, P, 3) samples of closed surfaces and their outward unit normals. The
-        objects of a scene hide each other.
+      points: (S, O, P, 3) samples of closed surfaces. The objects of a scene hide each other.
+      normals: (S, O, P, 3) the outward unit normals there.
       cameras: (S, K, 3) positions. They look at the middle of the scene.
       spacing: (S, O) or one number: distance of neighbouring samples, sqrt(area / P).
 
@@ -106,8 +106,8 @@ def observe(
     (`distinct` 0), points and index are 0. Raises `CameraError` for wrong shapes.
 
     Args:
-      points, normals: (S, O, P, 3) samples of closed surfaces and their outward unit normals. The
-        objects of a scene hide each other.
+      points: (S, O, P, 3) samples of closed surfaces. The objects of a scene hide each other.
+      normals: (S, O, P, 3) the outward unit normals there.
       cameras: (S, K, 3) positions. They look at the middle of the scene.
       spacing: (S, O) or one number: distance of neighbouring samples, sqrt(area / P).
       voxel: m, width of the grid.

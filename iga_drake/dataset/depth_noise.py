@@ -85,7 +85,9 @@ def noisy_samples(
     """Measured over true depth (M,) of surface samples, and which of them (M,) aren't lost.
 
     Args:
-      u, v, w: (M,) x / z, y / z and 1 / z (1/m) in the camera's axes (x right, y down, z forwards).
+      u: (M,) x / z in the camera's axes (x right, y down, z forwards).
+      v: (M,) y / z.
+      w: (M,) 1 / z (1/m).
       cosine: (M,) of the angle between the surface's normal and the ray to the camera.
       edge: (M,) bool, beside a depth edge, on the near side.
       image: (M,) int, the image in which each is seen, below `images`; patches are an image's own.

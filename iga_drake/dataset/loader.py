@@ -139,7 +139,8 @@ def sample_loader(
       batch: samples a batch, of this rank.
       workers: processes that make samples; 0 makes them in this one.
       first: index of the first sample of all ranks; to resume after t steps add t world batch.
-      rank, world: this process's number among all that train together, and theirs.
+      rank: this process's number among all that train together, from 0.
+      world: number of processes that train together.
       count: samples of all ranks together; None goes on for ever. The last batch may be short, and
         the last ranks may get one batch fewer.
       prefetch: batches that every worker makes ahead.

@@ -19,6 +19,7 @@ HAND_OPENING_MAX = 0.08  # m, both fingers of the Franka Hand together
 Frame = Literal["E", "W"]
 ObservedRole = Literal["target", "grasped", "gripper"]
 FRAMES: tuple[Frame, ...] = get_args(Frame)
+_WHERE = {"E": "in the hand", "W": "where it stood"}
 OBSERVED_ROLES: tuple[ObservedRole, ...] = get_args(ObservedRole)
 
 
@@ -195,7 +196,8 @@ class Demonstration:
                 if found != frame:
                     raise DemonstrationError(
                         f"waypoint '{waypoint.name}': the {role} observation '{name}' is in frame "
-                        f"{found}, {frame} expected"
+                        f"{found}, {frame} expected: relate the one that was made of it "
+                        f"{_WHERE[frame]}"
                     )
                 used.add(name)
         unused = sorted(set(self.observations) - used)

@@ -14,7 +14,7 @@ aligner in sets of relations, in others only on demand.
 
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +22,13 @@ import numpy as np
 
 from iga_drake.aligners.iga.weights import DESCRIPTOR
 from iga_drake.aligners.protocol import Aligner
-from iga_drake.aligners.query import Query
+from iga_drake.aligners.query import sample_query
 from iga_drake.aligners.registry import ORACLE
 from iga_drake.checkpoint import file_digest, load_checkpoint
-from iga_drake.dataset.alignment_error import CONFIG, equivalents, nearest_error, random_pose
-from iga_drake.dataset.field_versions import FIELD_KINDS, field_clouds
+from iga_drake.dataset.alignment_error import CONFIG, equivalents, nearest_error
+from iga_drake.dataset.field_versions import FIELD_KINDS
 from iga_drake.dataset.oracle import oracle_pose
-from iga_drake.dataset.samples import Sample, make_sample
+from iga_drake.dataset.samples import make_sample
 from iga_drake.dataset.splits import sample_set, sample_sets
 from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, config_digest
@@ -140,32 +140,6 @@ class AlignmentErrors:
 
 
 HEADER = f"{'aligner':<8} {'set':<24} {'count':>5}  {'error':<6}  {COLUMNS}   s"
-
-
-def sample_query(
-    sample: Sample, split: str, index: int, *, up: bool = False, field: str = ""
-) -> Query:
-    """The query about sample `index` of a set that every aligner gets.
-
-    Args:
-      sample: the sample itself.
-      split: the name of its set.
-      index: of the sample.
-      up: give the directions that are up, of the objects that have one.
-      field: disturb the clouds in this way, one of FIELD_KINDS; none: clean clouds.
-    """
-    A, B = (each if up and each.any(1).all() else None for each in sample.up.astype(np.float64))
-    start = random_pose(index)
-    query = Query.of(sample.points, start, grasped_up=A, target_up=B)
-    if not field:
-        return query
-    clouds_A, clouds_B = field_clouds(sample, field, split, index)
-    context = tuple(
-        replace(shown, grasped=clouds_A[n], target=clouds_B[n])
-        for n, shown in enumerate(query.context)
-    )
-    grasped = clouds_A[-1] @ start[:3, :3].T + start[:3, 3]
-    return replace(query, context=context, grasped=grasped, target=clouds_B[-1])
 
 
 def evaluate_sample(

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 from scipy.stats import binomtest
@@ -152,24 +153,33 @@ def _printable(text: str) -> str:
 
 
 def markdown_summary(results: Sequence[TrialResult], comparison: Comparison | None = None) -> str:
-    """A table of rates with 95 % intervals, then the failures and what changed."""
+    """A table of scenarios by aligners, one of rates with 95 % intervals, causes of failure and
+    times, then the failures and what changed."""
+    rows = summarise_trials(results)
 
     def number(value: float | None, scale: float, unit: str) -> str:
-        return "-" if value is None else f"{scale * value:.2f} {unit}"
+        return "-" if value is None else f"{scale * value:.2f} {unit}".rstrip()
 
-    lines = [
-        "| scenario | aligner | success | 95 % interval | position | rotation | inference |",
-        "|---|---|---|---|---|---|---|",
+    lines = _rates(rows)
+    lines += [
+        "",
+        "| scenario | aligner | success | 95 % interval | causes | position | rotation | inference "
+        "| simulated, mean | wall clock, mean | real-time factor |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     failures = []
-    for row in summarise_trials(results):
+    for row in rows:
+        causes = ", ".join(f"{cause} {count}" for cause, count in row["causes"].items())
         low, high = row["wilson_95"]
         lines.append(
             f"| {_cell(row['scenario'])} | {_cell(row['aligner'])} "
             f"| {row['successes']} of {row['trials']} | {100 * low:.0f} to {100 * high:.0f} % "
+            f"| {_cell(causes) or '-'} "
             f"| {number(row['median_position_error_m'], 100, 'cm')} "
             f"| {number(row['median_rotation_error_rad'], 180 / math.pi, '°')} "
-            f"| {number(row['median_inference_s'], 1, 's')} |"
+            f"| {number(row['median_inference_s'], 1, 's')} "
+            f"| {number(row['mean_simulated_s'], 1, 's')} | {number(row['mean_wall_s'], 1, 's')} "
+            f"| {number(row['median_real_time_factor'], 1, '')} |"
         )
         failures += [
             f"| {_cell(row['scenario'])} | {_cell(row['aligner'])} | {failure['seed']} "
@@ -183,6 +193,23 @@ def markdown_summary(results: Sequence[TrialResult], comparison: Comparison | No
         head, *changed = comparison.lines()
         lines += ["", head[0].upper() + head[1:], "", *(f"- {line.strip()}" for line in changed)]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _rates(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Lines of a table: successes of trials, scenarios down and aligners across."""
+    aligners = list(dict.fromkeys(row["aligner"] for row in rows))
+    found = {(row["scenario"], row["aligner"]): row for row in rows}
+    lines = [
+        "| " + " | ".join(["scenario", *map(_cell, aligners)]) + " |",
+        "|" + "---|" * (1 + len(aligners)),
+    ]
+    for scenario in dict.fromkeys(row["scenario"] for row in rows):
+        cells = [_cell(scenario)]
+        for aligner in aligners:
+            row = found.get((scenario, aligner))
+            cells.append("-" if row is None else f"{row['successes']} of {row['trials']}")
+        lines.append("| " + " | ".join(cells) + " |")
+    return lines
 
 
 def _cell(text: str) -> str:

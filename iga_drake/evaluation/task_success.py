@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -15,14 +16,14 @@ from pathlib import Path
 from statistics import NormalDist
 from typing import Any
 
-from iga_drake.aligners.registry import EXPERT, make_aligner
+from iga_drake.aligners.registry import PRIVILEGED, make_aligner
 from iga_drake.cluster import connect_cluster
 from iga_drake.errors import IgaDrakeError, error_text
 from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, folder_digest
 from iga_drake.files import process_lives
 from iga_drake.station.scenario import Scenario
 from iga_drake.tasks.episode import demonstrations_path
-from iga_drake.tasks.registry import make_task
+from iga_drake.tasks.registry import scenario_task
 
 BROKEN = "error"  # cause of a trial whose process broke
 
@@ -69,6 +70,7 @@ class TrialResult:
     rotation_error: float | None = None
     inference_seconds: float | None = None
     real_time_factor: float | None = None
+    simulated_seconds: float | None = None
     wall_seconds: float | None = None
     reused: bool = False  # measured before, and found in a results file
 
@@ -80,13 +82,13 @@ def trial_key(scenario: Scenario) -> dict[str, Any]:
     Loads the aligner to learn its weights' digest. Raises `AlignerError` if that fails.
     """
     name, options = scenario.aligner.name, scenario.aligner.options
-    aligner = None if name == EXPERT else make_aligner(name, **options)
+    aligner = None if name in PRIVILEGED else make_aligner(name, **options)
     return {
         "kind": "tasks",
         "scenario": scenario.digest,
         "demonstrations": folder_digest(demonstrations_path(scenario)),
         **aligner_key(aligner, name, options),
-        "code": code_key(aligner, make_task(scenario.task.name)),
+        "code": code_key(aligner, scenario_task(scenario)),
     }
 
 
@@ -188,7 +190,7 @@ def _remove_left() -> None:
 
 _MEASURED = (
     "task", "success", "cause", "reason", "position_error", "rotation_error", "inference_seconds",
-    "real_time_factor", "wall_seconds",
+    "real_time_factor", "simulated_seconds", "wall_seconds",
 )  # fmt: skip
 
 
@@ -246,6 +248,11 @@ def _median(values: Iterable[float | None]) -> float | None:
     return present[len(present) // 2] if present else None
 
 
+def _mean(values: Iterable[float | None]) -> float | None:
+    present = [value for value in values if value is not None]
+    return math.fsum(present) / len(present) if present else None
+
+
 def summarise_trials(results: Sequence[TrialResult]) -> list[dict[str, Any]]:
     """One row for each scenario and aligner, in the order of their first result."""
     rows = []
@@ -266,6 +273,9 @@ def summarise_trials(results: Sequence[TrialResult]) -> list[dict[str, Any]]:
                 "median_rotation_error_rad": _median(r.rotation_error for r in mine),
                 "median_inference_s": _median(r.inference_seconds for r in mine),
                 "median_real_time_factor": _median(r.real_time_factor for r in mine),
+                "mean_simulated_s": _mean(r.simulated_seconds for r in mine),
+                "mean_wall_s": _mean(r.wall_seconds for r in mine),
+                "causes": dict(sorted(Counter(r.cause for r in mine if not r.success).items())),
                 "reused": sum(r.reused for r in mine),
                 "failures": [
                     {"seed": r.seed, "cause": r.cause, "reason": r.reason}

@@ -14,7 +14,8 @@ def rigid_fit(source: np.ndarray, destination: np.ndarray) -> tuple[np.ndarray, 
     Least squares over corresponding points (Kabsch 1976); R never reflects.
 
     Args:
-      source, destination: (..., n, 3), in any unit; leading dimensions are broadcast.
+      source: (..., n, 3), in any unit; leading dimensions are broadcast with `destination`'s.
+      destination: (..., n, 3), in the same unit.
     """
     source_mean = source.mean(-2, keepdims=True)
     mean = destination.mean(-2, keepdims=True)

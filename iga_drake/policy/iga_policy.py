@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context, InputPort, LeafSystem, State
 
 from iga_drake.demonstrations.demonstration import ObservedRole
 from iga_drake.policy.machine import PolicyMachine, PolicyMemory
+from iga_drake.policy.motion import MotionStep, Phase
 from iga_drake.systems.fusion import CameraCounts
 from iga_drake.systems.messages import FollowerStatus, SupervisorStatus
 from iga_drake.systems.ports import PANDA_JOINTS
@@ -39,7 +40,9 @@ class IgaPolicy(LeafSystem):
         - status
         - observations
         - estimates
+        - chosen
         - energies
+        - steps
 
     - `target_cloud`, `grasped_cloud` (PointCloud, m in W): what the cameras see of each role.
     - `camera_counts` (dict of camera name -> `CameraCounts`): a camera with a problem is waited
@@ -49,7 +52,10 @@ class IgaPolicy(LeafSystem):
     - `status` (PolicyStatus): phase, timeline, reason.
     - `observations` (dict of name -> `Observation`): the clouds observed so far.
     - `estimates` (tuple of `PoseEstimate`): of each waypoint inferred so far.
+    - `chosen` (tuple of `ReachablePose`): the pose settled on for each waypoint inferred so far.
     - `energies` (T): energy of the pose chosen for each waypoint; NaN before there is one.
+    - `steps` (tuple of `MotionStep`): what is left of the motion under way, the present step first;
+      empty while nothing moves.
     """
 
     def __init__(self, machine: PolicyMachine) -> None:
@@ -86,12 +92,14 @@ class IgaPolicy(LeafSystem):
         declare("status", start.status, lambda memory: memory.status)
         declare("observations", {}, lambda memory: dict(memory.observations))
         declare("estimates", (), lambda memory: memory.estimates)
+        declare("chosen", (), lambda memory: memory.chosen)
         self.DeclareVectorOutputPort(
             "energies",
             len(machine.motion.waypoints),
             self._calc_energies,
             prerequisites_of_calc=state,
         )
+        declare("steps", (), _steps_left)
         self.DeclarePeriodicUnrestrictedUpdateEvent(machine.config.period, 0.0, self._update)
 
     def memory(self, context: Context) -> PolicyMemory:
@@ -110,6 +118,11 @@ class IgaPolicy(LeafSystem):
             self.memory(context), _Pull(self, context), context.get_time()
         )
         state.get_mutable_abstract_state(int(self._memory_index)).set_value(memory)
+
+
+def _steps_left(memory: PolicyMemory) -> tuple[MotionStep, ...]:
+    moves = memory.status.phase in (Phase.PRESENT, Phase.MOVE)
+    return memory.steps[memory.step :] if moves else ()
 
 
 class _Pull:

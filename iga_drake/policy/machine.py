@@ -82,8 +82,9 @@ class PolicyConfig:
     infer_delay: float = 1.0
     # Limit (s) of each inference, wall-clock time.
     infer_limit: float = 60.0
-    # Least `PoseEstimate.familiarity`, in [0, 1]: below it the policy refuses. 0 refuses nothing.
-    minimum_familiarity: float = 0.0
+    # Least `PoseEstimate.familiarity` of both objects, in [0, 1]: below it the policy refuses. 0
+    # refuses nothing.
+    minimum_familiarity: float = 0.5
     # Whether aligners are told which way is up for the objects that the task says are upright
     # (`ObservationPlan.upright`), where all demonstrations say so too. To be switched off where
     # such objects may lie on their side; demonstrations recorded then don't call them upright.
@@ -459,18 +460,27 @@ class PolicyMachine:
         """Settles on a pose of the last estimate."""
         config, index = self.config, len(memory.estimates) - 1
         estimate, seconds = memory.estimates[index], memory.status.inference_seconds[index]
-        familiarity, least = estimate.familiarity, config.minimum_familiarity
-        if familiarity is not None and not familiarity >= least:
-            raise Refusal(
-                f"aligner {self.inference.name}: these objects look like none of the "
-                f"demonstrations (familiarity {familiarity:.2f}, {least:g} is asked for): "
-                "demonstrate the task with such objects, or ask for less",
-                Cause.ALIGNMENT,
-            )
+        least = config.minimum_familiarity
+        if estimate.familiarity is not None:
+            unknown = [
+                f"the {name} object looks like none of the demonstrations' (familiarity "
+                f"{value:.2f})"
+                for name, value in zip(("grasped", "target"), estimate.familiarity, strict=True)
+                if not value >= least
+            ]
+            if unknown:
+                raise Refusal(
+                    f"aligner {self.inference.name}: {'; '.join(unknown)}; at least "
+                    f"{least:g} is asked for: is it seen whole and alone? Demonstrate the task "
+                    "with such objects, or ask for less (policy.minimum_familiarity)",
+                    Cause.ALIGNMENT,
+                )
+        # The arm comes from the waypoint before, unless it is there already or was elsewhere since.
+        moved = len(memory.chosen) == memory.followed
         chosen = choose_reachable(
             estimate,
             self.motion.waypoints[index],
-            near=memory.chosen[-1].posture if memory.chosen else inputs.position(),
+            near=inputs.position() if moved else memory.chosen[-1].posture,
             solve=self._solve,
             workspace=self._workspace,
             limit=config.infer_limit - seconds,

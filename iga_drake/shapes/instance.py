@@ -39,6 +39,8 @@ class ShapeInstance:
     convex_pieces: tuple[np.ndarray, ...] = ()  # each (n >= 4, 3) m, union covers the solid
     density: float = 1000.0  # kg / m^3
     symmetry: Symmetry = NO_SYMMETRY  # rotations about an axis of O that carry it onto itself
+    # Mass and inertia as somebody states them; None: those of the homogeneous solid.
+    stated_mass: MassProperties | None = None
 
     def __post_init__(self) -> None:
         vertices = np.asarray(self.vertices, dtype=np.float64)
@@ -108,10 +110,12 @@ class ShapeInstance:
 
     @cached_property
     def mass_properties(self) -> MassProperties:
-        """Mass and inertia of the homogeneous solid; overlaps of joined parts count twice.
+        """The stated ones, or those of the homogeneous solid; overlaps of joined parts count twice.
 
-        Raises `ShapeError` where the mesh is not closed or is turned inside out.
+        Raises `ShapeError` where none are stated and the mesh is not closed or is inside out.
         """
+        if self.stated_mass is not None:
+            return self.stated_mass
         self.check_closed()
         properties = self.mesh.mass_properties
         return MassProperties(
@@ -127,6 +131,16 @@ class ShapeInstance:
         chosen = [self.part_names.index(name) for name in names]
         return self.vertices[np.unique(self.faces[np.isin(self.part_labels, chosen)])]
 
+    def part_pieces(self, *names: str) -> tuple[int, ...]:
+        """Indices of the convex pieces whose corners are all vertices of these parts. Raises
+        `ShapeError` where one isn't there."""
+        corners = {tuple(vertex) for vertex in self.part_vertices(*names).tolist()}
+        return tuple(
+            index
+            for index, piece in enumerate(self.convex_pieces)
+            if all(tuple(corner) in corners for corner in piece.tolist())
+        )
+
     def check_closed(self) -> None:
         """Raises `ShapeError` unless the faces close the solid and all look outwards."""
         self._require(self.mesh.is_watertight, "the mesh is not watertight")
@@ -135,8 +149,12 @@ class ShapeInstance:
 
     def with_mass(self, mass: float) -> "ShapeInstance":
         """A copy of the shape with the density that gives it `mass` (kg)."""
-        scale = mass / self.mass_properties.mass
-        return dataclasses.replace(self, density=self.density * scale)
+        now = self.mass_properties
+        scale = mass / now.mass
+        stated = None
+        if self.stated_mass is not None:
+            stated = MassProperties(mass, now.p_OCcm, now.I_CcmO * scale)
+        return dataclasses.replace(self, density=self.density * scale, stated_mass=stated)
 
 
 def frame(

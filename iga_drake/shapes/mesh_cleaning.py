@@ -27,6 +27,14 @@ _HOLE_EDGES = 64
 _FIN_AREA = 0.02
 
 
+# R_OF for a file F whose axis of this name points up; the object O has z up.
+UP_AXES = {
+    "x": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "z": np.eye(3),
+}
+
+
 class MeshError(ShapeError):
     """A mesh can't be used; the message is the reason alone, the reader adds the name."""
 
@@ -42,6 +50,8 @@ class MeshCleaning:
     extent: float | None = None
     # Puts the centre of the bounding box at the origin.
     centre: bool = True
+    # The file's axis that points up, "x", "y" or "z"; "": what is usual in files of its kind.
+    up: str = ""
     # Face budget: larger meshes are decimated (quadric error), which needs fast-simplification.
     faces: int | None = None
 
@@ -49,6 +59,8 @@ class MeshCleaning:
         for name, value in (("scale", self.scale), ("extent", self.extent)):
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise ShapeError(f"MeshCleaning: {name} = {value}, must be positive")
+        if self.up not in ("", *UP_AXES):
+            raise ShapeError(f"MeshCleaning: up = '{self.up}', must be one of {', '.join(UP_AXES)}")
         if self.faces is not None and self.faces < 4:
             raise ShapeError(f"MeshCleaning: faces = {self.faces}, at least 4 make a solid")
 
@@ -58,17 +70,19 @@ def clean_mesh(
 ) -> trimesh.Trimesh:
     """A cleaned copy of `mesh`, in metres and z up.
 
-    Merges vertices, drops degenerate and doubled faces, makes the winding consistent, fills small
-    holes and turns solids outwards. An open mesh is turned so that the volume between it and its
-    holes' mean is positive: right for a scan with a hole, a guess for a sheet.
+    `y_up` holds where `cleaning` names no axis. Merges vertices, drops degenerate and doubled
+    faces, makes the winding consistent, fills small holes and turns solids outwards. An open mesh
+    is turned so that the volume between it and its holes' mean is positive: right for a scan with a
+    hole, a guess for a sheet.
 
     Raises `MeshError` where no face is left or a used vertex is not finite, `ShapeError` where the
     decimation's library is missing.
     """
     cleaning = cleaning or MeshCleaning()
     mesh = _checked(mesh)
-    if y_up:  # y -> z, z -> -y
-        mesh.vertices = mesh.vertices @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    up = cleaning.up or ("y" if y_up else "z")
+    if up != "z":
+        mesh.vertices = mesh.vertices @ UP_AXES[up].T
     extent = float(mesh.extents.max())
     _drop_bad_faces(mesh, extent)
     _repair(mesh)
@@ -88,10 +102,18 @@ def is_solid(mesh: trimesh.Trimesh) -> bool:
     return bool(mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0)
 
 
+def checked_vertices(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Positions (V, 3) of a mesh as read. Raises `MeshError` where they have other dimensions."""
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise MeshError(f"vertices of shape {vertices.shape}: three coordinates each expected")
+    return vertices
+
+
 def _checked(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """A copy with positions and faces alone, all finite."""
     faces = np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
-    vertices = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3)
+    vertices = checked_vertices(mesh)
     if len(faces) == 0:
         raise MeshError(f"no faces ({len(vertices)} vertices)")
     if faces.min() < 0 or faces.max() >= len(vertices):

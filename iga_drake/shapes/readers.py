@@ -11,6 +11,7 @@ are skipped and reported by name with the reason:
 """
 
 import hashlib
+import io
 import json
 import os
 import re
@@ -26,11 +27,17 @@ import numpy as np
 import trimesh
 
 from iga_drake.shapes.errors import ShapeError
-from iga_drake.shapes.mesh_cleaning import MeshCleaning, MeshError, clean_mesh, is_solid
+from iga_drake.shapes.mesh_cleaning import (
+    MeshCleaning,
+    MeshError,
+    checked_vertices,
+    clean_mesh,
+    is_solid,
+)
 
 FORMATS = (".glb", ".gltf", ".obj", ".ply", ".stl")
 # glTF defines y as up; the other formats say nothing and are taken as they are.
-_Y_UP_FORMATS = (".glb", ".gltf")
+Y_UP_FORMATS = (".glb", ".gltf")
 SHAPENET_MESH = Path("models") / "model_normalized.obj"
 
 Split = Literal["train", "held_out"]
@@ -138,7 +145,7 @@ def list_folder(folder: Path | str) -> tuple[MeshEntry, ...]:
             category=path.parent.as_posix() if path.parent.parts else root.resolve().name,
             path=root / path,
             source=str(root / path),
-            y_up=path.suffix.lower() in _Y_UP_FORMATS,
+            y_up=path.suffix.lower() in Y_UP_FORMATS,
         )
         for path in paths
     )
@@ -317,19 +324,62 @@ def _load(path: Path) -> trimesh.Trimesh:
         raise MeshError(f"{path}: {error.strerror}") from error
     if size == 0:
         raise MeshError("the file is empty")
+    with path.open("rb") as file:
+        begin = file.read(200).lstrip().lower()
+    for mark, what in _NO_MESH.items():
+        if begin.startswith(mark):
+            raise MeshError(what)
     try:
         scene = trimesh.load_scene(path, process=False)
+        if path.suffix.lower() == ".obj":
+            text = path.read_text(encoding="utf-8", errors="replace")
+            if _RELATIVE.search(text):  # trimesh takes them for those of the whole file
+                absolute = io.StringIO(_absolute_indices(text))
+                scene = trimesh.load_scene(absolute, file_type="obj", process=False)
         meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
     except Exception as error:  # parsers of broken files raise anything
         reason = " ".join(str(error).split())[:200]
         raise MeshError(f"not readable: {type(error).__name__}: {reason}") from error
     if not meshes:
-        raise MeshError("no faces: a point cloud or an empty scene")
+        cut = " or a file that was cut short" if path.suffix.lower() == ".stl" else ""
+        raise MeshError(f"no faces: a point cloud, an empty scene{cut}")
     offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return trimesh.Trimesh(
-        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
+        vertices=np.concatenate([checked_vertices(mesh) for mesh in meshes]),
         faces=np.concatenate(
             [mesh.faces + start for mesh, start in zip(meshes, offsets, strict=True)]
         ),
         process=False,
     )
+
+
+# What files begin with that are something else than their names say.
+_NO_MESH = {
+    b"version https://git-lfs": "a pointer of Git LFS in place of the mesh: run `git lfs pull`",
+    b"<!doctype html": "a web page in place of the mesh: download it again",
+    b"<html": "a web page in place of the mesh: download it again",
+}
+_RELATIVE = re.compile(r"^f .*(?<![\w.])-\d", re.MULTILINE)
+_COUNTED = {"v": 0, "vt": 1, "vn": 2}
+
+
+def _absolute_indices(text: str) -> str:
+    """The text of an .obj whose faces count vertices, textures and normals from the file's start;
+    negative indices count back from the face."""
+    counts = [0, 0, 0]
+    lines = []
+    for line in text.splitlines():
+        words = line.split()
+        if words and words[0] in _COUNTED:
+            counts[_COUNTED[words[0]]] += 1
+        elif words and words[0] == "f":
+            corners = [
+                "/".join(
+                    str(counts[kind] + 1 + int(index)) if index.startswith("-") else index
+                    for kind, index in enumerate(word.split("/"))
+                )
+                for word in words[1:]
+            ]
+            line = " ".join(["f", *corners])
+        lines.append(line)
+    return "\n".join(lines) + "\n"

@@ -2,7 +2,7 @@
 
 The visual mesh carries normals with creases kept sharp. The collision geometry is the instance's
 convex pieces, rigid hydroelastic: a compliant finger pad gets a hydroelastic contact surface with
-them, anything else rigid falls back to point contact.
+them, anything else rigid falls back to point contact. Pieces may be soft instead.
 """
 
 import hashlib
@@ -11,6 +11,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,19 @@ from iga_drake.shapes.instance import ShapeInstance
 _CREASE = np.radians(40.0)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Softness:
+    """How a collision piece gives way, in place of a rigid one."""
+
+    # Pressure (Pa) at the piece's middle in contact surfaces, which it has with what is
+    # hydroelastic too; from 0 at its surface.
+    modulus: float
+    # Force (N) per penetration (m) at contact points, which it has with everything else.
+    stiffness: float
+    # Coulomb coefficient, in place of the object's.
+    friction: float
+
+
 def write_sdf(
     instance: ShapeInstance,
     folder: Path | str,
@@ -31,6 +45,7 @@ def write_sdf(
     name: str,
     color: tuple[float, float, float] = (0.8, 0.8, 0.8),
     friction: float = 0.8,
+    soft: Mapping[int, Softness] | None = None,
 ) -> str:
     """Writes the meshes of `instance` below `folder` and returns SDF text that refers to them.
 
@@ -41,9 +56,10 @@ def write_sdf(
       color: diffuse, r, g, b in [0, 1].
       friction: Coulomb coefficient, static = dynamic. Drake combines two bodies' coefficients a, b
         into 2 a b / (a + b).
+      soft: the convex pieces that are not rigid, by their index.
     """
     meshes = _write_meshes(instance, Path(folder))
-    return _sdf(instance, meshes.as_uri(), name=name, color=color, friction=friction)
+    return _sdf(instance, f"file://{meshes}", name=name, color=color, friction=friction, soft=soft)
 
 
 def write_sdf_file(
@@ -88,6 +104,7 @@ def _sdf(
     color: tuple[float, float, float],
     friction: float,
     frames: Mapping[str, np.ndarray] | None = None,
+    soft: Mapping[int, Softness] | None = None,
 ) -> str:
     """SDF text; `meshes` is the URI of the folder with visual.obj and piece_<i>.obj."""
     mass = instance.mass_properties
@@ -99,10 +116,7 @@ def _sdf(
         <geometry><mesh>
           <uri>{meshes}/piece_{index}.obj</uri><drake:declare_convex/>
         </mesh></geometry>
-        <drake:proximity_properties>
-          <drake:rigid_hydroelastic/>
-          <drake:mu_static>{friction:.4g}</drake:mu_static>
-          <drake:mu_dynamic>{friction:.4g}</drake:mu_dynamic>
+        <drake:proximity_properties>{_contact(friction, (soft or {}).get(index))}
         </drake:proximity_properties>
       </collision>"""
         for index in range(len(instance.convex_pieces))
@@ -137,6 +151,20 @@ def _sdf(
 """
 
 
+def _contact(friction: float, softness: Softness | None) -> str:
+    """The proximity properties of one collision piece."""
+    kind = "<drake:rigid_hydroelastic/>"
+    if softness is not None:
+        friction = softness.friction
+        kind = f"""<drake:compliant_hydroelastic/>
+          <drake:hydroelastic_modulus>{softness.modulus:.6g}</drake:hydroelastic_modulus>
+          <drake:point_contact_stiffness>{softness.stiffness:.6g}</drake:point_contact_stiffness>"""
+    return f"""
+          {kind}
+          <drake:mu_static>{friction:.4g}</drake:mu_static>
+          <drake:mu_dynamic>{friction:.4g}</drake:mu_dynamic>"""
+
+
 def _pose(X: np.ndarray) -> str:
     """x y z qx qy qz qw of a transform (4, 4)."""
     quaternion = Rotation.from_matrix(X[:3, :3]).as_quat()
@@ -151,7 +179,7 @@ def _write_meshes(instance: ShapeInstance, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=folder))
     try:
-        (temporary / "visual.obj").write_text(_visual_obj(instance.mesh))
+        (temporary / "visual.obj").write_text(visual_obj(instance.mesh))
         for index, piece in enumerate(instance.convex_pieces):
             hull = trimesh.convex.convex_hull(piece)
             (temporary / f"piece_{index}.obj").write_text(_obj(hull.vertices, hull.faces))
@@ -173,7 +201,7 @@ def _digest(instance: ShapeInstance) -> str:
     return digest.hexdigest()[:16]
 
 
-def _visual_obj(mesh: trimesh.Trimesh) -> str:
+def visual_obj(mesh: trimesh.Trimesh) -> str:
     """An .obj whose normals are averaged over a vertex's faces that meet at less than a crease."""
     corner_normals = _corner_normals(mesh)
     keys, index = np.unique(np.round(corner_normals.reshape(-1, 3), 5), axis=0, return_inverse=True)

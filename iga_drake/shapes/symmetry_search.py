@@ -53,8 +53,8 @@ def find_symmetries(
     about one axis are found.
 
     Args:
-      points, normals: (S, 3) m and unit, samples of the surface about evenly dense, and their
-        outward normals.
+      points: (S, 3) samples of the surface (m), about evenly dense.
+      normals: (S, 3) the outward unit normals there.
       orders: of the axes looked for. With (2,) alone half-turns about the three principal axes are
         tried and nothing else, which is quick.
       queries: points by which a rotation is judged, at most.

@@ -29,11 +29,13 @@ from iga_drake.policy.machine import PolicyConfig
 from iga_drake.station.cameras.clutter import Clutter
 from iga_drake.station.cameras.kinds import camera_type
 from iga_drake.station.cameras.rgbd import LookAt, RgbdCamera
+from iga_drake.station.declaration import TaskDeclaration
 from iga_drake.station.hardware.config import Hardware
 from iga_drake.station.panda.command import Panda
 from iga_drake.station.panda.driver import PandaDriver
 from iga_drake.systems.differential_ik import DifferentialIkConfig
 from iga_drake.systems.fusion import FusionConfig
+from iga_drake.systems.geometric_segmentation import SegmentationConfig
 from iga_drake.systems.ports import PANDA_JOINTS
 from iga_drake.systems.supervisor import SupervisorConfig
 from iga_drake.systems.waypoint_follower import WaypointFollowerConfig
@@ -93,10 +95,12 @@ def _cameras() -> dict[str, RgbdCamera]:
 class TaskChoice:
     """The task to do, by name, and its time limit."""
 
-    # Name in the task registry of `iga_drake.tasks`.
+    # Name in the task registry of `iga_drake.tasks`, or, with `declared`, a new one.
     name: str = "grasp"
     # Simulated time after which the episode has failed (s), > 0.
     time_limit: float = 120.0
+    # The task itself, where no registered one is meant.
+    declared: TaskDeclaration | None = None
 
 
 @dataclass
@@ -142,9 +146,14 @@ class Scenario:
     # Name -> camera of any kind, at least one. A file that has this section states all cameras it
     # wants; what is no plain RGB-D camera has a tag, the name of its kind's class.
     cameras: dict[str, RgbdCamera] = field(default_factory=_cameras)
+    # Number of further objects on the table, of families that the task isn't about, out of the way
+    # and background to the cameras (`iga_drake.tasks.distractors`).
+    distractors: int = 0
     # Errors of the simulated cameras at the objects: masks that leak, stray depth.
     clutter: Clutter = field(default_factory=Clutter)
     fusion: FusionConfig = field(default_factory=FusionConfig)
+    # Whose labels tell the objects apart: the station's, or those of the geometric segmenter.
+    segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
     planning: PlanningConfig = field(default_factory=PlanningConfig)
     control: WaypointFollowerConfig = field(default_factory=WaypointFollowerConfig)
     differential_ik: DifferentialIkConfig = field(default_factory=DifferentialIkConfig)
@@ -167,8 +176,12 @@ class Scenario:
 
     @property
     def digest(self) -> str:
-        """First 16 hexadecimal digits of the SHA-256 of `to_yaml()`; files' places don't matter."""
+        """First 16 hexadecimal digits of the SHA-256 of `to_yaml()`; files' places don't matter
+        and the content of the objects' files does."""
         said = dataclasses.replace(self, demonstrations=Path(self.demonstrations).name)
+        if self.task.declared is not None:
+            declared = self.task.declared.portable()
+            said = dataclasses.replace(said, task=dataclasses.replace(self.task, declared=declared))
         return hashlib.sha256(said.to_yaml().encode()).hexdigest()[:16]
 
     def to_yaml(self) -> str:
@@ -215,6 +228,9 @@ def load_scenario(
                 f"{file}: {size} bytes, a scenario has at most {_LARGEST_FILE}: is it another file?"
             )
         scenario = _layered(scenario, text, str(file))
+        declared = scenario.task.declared
+        if declared is not None and not Path(declared.folder).is_absolute():
+            declared.folder = str((file.resolve().parent / declared.folder).resolve())
         if _states(text, "demonstrations"):
             beside = _beside(file, scenario.demonstrations)
             scenario = dataclasses.replace(scenario, demonstrations=beside)
@@ -454,8 +470,10 @@ def _check_values(s: Scenario) -> None:
         check_range(good, "cameras", name, "names of 1 to 64 printable characters")
     for name, camera in s.cameras.items():
         camera.check(f"cameras.{name}")
+    check_range(0 <= s.distractors <= 20, "distractors", s.distractors, "0 to 20")
     s.clutter.check("clutter")
     s.fusion.check("fusion")
+    s.segmentation.check("segmentation")
     s.planning.check("planning")
     s.control.check("control")
     s.differential_ik.check(s.control.period, "differential_ik")
@@ -463,6 +481,8 @@ def _check_values(s: Scenario) -> None:
     s.policy.check("policy")
     s.visualization.check("visualization")
     check_bounds(s.task, "task", {"time_limit": (1e-3, 86_400.0)})
+    if s.task.declared is not None:
+        s.task.declared.check("task.declared")
     check_range(1 <= s.context_size <= 1000, "context_size", s.context_size, "1 to 1000")
     check_bounds(s.seeds, "seeds", dict.fromkeys(vars(s.seeds), (0, _MOST_SEED)))
 

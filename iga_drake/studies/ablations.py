@@ -72,7 +72,7 @@ class Setup:
     voting: VotingConfig = field(default_factory=VotingConfig)
     energy: EnergyConfig = field(default_factory=EnergyConfig)
     energy_training: EnergyTraining = field(
-        default_factory=lambda: EnergyTraining(problems=450, modes_problems=150, foreign_problems=0)
+        default_factory=lambda: EnergyTraining(problems=450, modes_problems=150)
     )
     # Initial weights of the descriptors: "random", or the "occupancy" encoder's; "untrained" ones
     # are random and stay so.

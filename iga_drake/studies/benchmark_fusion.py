@@ -3,7 +3,9 @@
 The images are rendered from the default scenario's cameras, with noise. "whole images": every pixel
 inside the crop box belongs to the target. "objects": only the pixels of the objects do, as when the
 robot works. The other libraries get the whole images: unproject, crop, join, voxel filter; ours
-also counts pixels, drops those near jumps in depth, and removes specks.
+also counts pixels, drops those near jumps in depth, and removes specks. "geometric labels":
+the time in which the geometric segmenter makes the three label images; its points are the pixels
+labelled.
 """
 
 import argparse
@@ -22,9 +24,11 @@ from iga_drake.progress import progress
 from iga_drake.station.cameras.rgbd import camera_info
 from iga_drake.station.make import make_station
 from iga_drake.station.panda.model import HOME_POSITION
+from iga_drake.station.perception import make_segmenter
 from iga_drake.station.scenario import Scenario
 from iga_drake.station.simulated.scene import Scene, SceneObject
-from iga_drake.systems.fusion import PointCloudFusion
+from iga_drake.systems.fusion import PointCloudFusion, pixel_rays
+from iga_drake.systems.geometric_segmentation import CameraView
 from iga_drake.systems.ports import Role
 
 # camera -> depth (m), label (role), X_WC
@@ -73,6 +77,7 @@ def benchmark_fusion(*, json: bool = False, repetitions: int = 15) -> dict:
         "ours, whole images": _ours(scenario, whole),
         "Drake, whole images": _drake(scenario, images),
         "ours, objects": _ours(scenario, images),
+        "geometric labels": _labels(scenario, images),
     }
     open3d = _open3d(scenario, images)
     if open3d is not None:
@@ -143,6 +148,24 @@ def _ours(scenario: Scenario, images: Images) -> Callable[[], int]:
             fusion.GetOutputPort(f"{name}_cloud").Eval(context) for name in ("target", "grasped")
         ]
         return sum(cloud.size() for cloud in clouds)
+
+    return run
+
+
+def _labels(scenario: Scenario, images: Images) -> Callable[[], int]:
+    """The geometric segmenter; returns the number of pixels of both objects."""
+    segmenter = make_segmenter(scenario)
+    views = {
+        name: CameraView(
+            depth[:, :, 0], pixel_rays(camera_info(scenario.cameras[name].intrinsics)), X_WC
+        )
+        for name, (depth, _, X_WC) in images.items()
+    }
+
+    def run() -> int:
+        labels = segmenter.segment(views, np.array(HOME_POSITION), 0.04).labels.values()
+        objects = (Role.TARGET, Role.GRASPED)
+        return sum(int(np.isin(label, objects).sum()) for label in labels)
 
     return run
 

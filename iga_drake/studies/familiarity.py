@@ -1,97 +1,110 @@
 """`iga evaluate familiarity`: how well an aligner tells objects that no demonstration showed.
 
-Every sample of a set is asked twice: as it is, and with demonstrations of other objects (for both,
-the grasped or the target object in turn; never of the same family). A caller refuses below a
-familiarity of its choice: the table gives both kinds of error for some.
+Every sample of a set is asked as it is (also symmetric objects), with each kind of foreign test
+objects in turn, and with clouds disturbed as in the field. A caller refuses where one of the two
+objects is less familiar than a threshold of its choice.
 """
 
 import argparse
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from iga_drake.aligners.iga.aligner import IgaAligner
 from iga_drake.aligners.protocol import Aligner
-from iga_drake.aligners.query import Query
-from iga_drake.dataset.alignment_error import CONFIG, random_pose
-from iga_drake.dataset.foreign import FOREIGN_KINDS, foreign_points, foreign_sample
+from iga_drake.aligners.query import Query, sample_query
+from iga_drake.dataset.alignment_error import CONFIG
+from iga_drake.dataset.field_versions import FIELD_KINDS
+from iga_drake.dataset.foreign import FOREIGN_KINDS
 from iga_drake.dataset.samples import make_sample
 from iga_drake.dataset.splits import sample_set
 from iga_drake.errors import IgaDrakeError
 from iga_drake.progress import progress
+from iga_drake.training.familiarity import foreign_query, is_right
 
-THRESHOLDS = (0.1, 0.3, 0.5, 0.7, 0.9)
-DEFAULT_SETS = ("unseen_instances", "unseen_categories")
+OWN = "own"
+DEFAULT_SETS = ("familiarity",)
+DEFAULT_FIELDS = ("ring", "half", "stray")
 
 
 @dataclass(frozen=True)
-class Familiarity:
-    """Familiarities, in [0, 1], of a set's samples with their own and foreign demonstrations."""
+class FamiliarityRow:
+    """One question and its answer."""
 
-    split: str
-    own: tuple[float, ...]  # one a sample
-    foreign: tuple[float, ...]  # one a sample; the kinds of FOREIGN_KINDS take turns
-
-    def refused(self, threshold: float) -> float:
-        """Share of the samples with their own demonstrations below a threshold."""
-        return float((np.array(self.own) < threshold).mean())
-
-    def accepted(self, threshold: float, kind: int | None = None) -> float:
-        """Share of the samples with foreign demonstrations at or above a threshold.
-
-        `kind`: index into FOREIGN_KINDS; None: all kinds. NaN if there are no such samples.
-        """
-        values = np.array(
-            self.foreign if kind is None else self.foreign[kind :: len(FOREIGN_KINDS)]
-        )
-        return float((values >= threshold).mean()) if len(values) else float("nan")
-
-    def area(self) -> float:
-        """Area under the ROC curve: how often an own context looks more familiar than a foreign one
-        (Mann & Whitney 1947)."""
-        difference = np.subtract.outer(np.array(self.own), np.array(self.foreign))
-        return float(((difference > 0) + 0.5 * (difference == 0)).mean())
-
-    def table(self) -> str:
-        """The shares refused and accepted at each of THRESHOLDS, as text."""
-        kinds = "".join(f"{name:>9}" for name in FOREIGN_KINDS)
-        lines = [
-            f"{self.split}, {len(self.own)} samples; own contexts look more familiar than foreign "
-            f"ones in {100 * self.area():.1f} % of the comparisons",
-            f"{'least familiarity':>17} {'own refused, %':>16} {'foreign accepted, %':>21}{kinds}",
-        ]
-        for threshold in THRESHOLDS:
-            each = "".join(
-                f"{100 * self.accepted(threshold, k):9.1f}" for k in range(len(FOREIGN_KINDS))
-            )
-            lines.append(
-                f"{threshold:17.1f} {100 * self.refused(threshold):16.1f} "
-                f"{100 * self.accepted(threshold):21.1f}{each}"
-            )
-        return "\n".join(lines)
+    index: int
+    kind: str  # OWN, one of FOREIGN_KINDS or one of FIELD_KINDS
+    familiarity: float  # of the less familiar object
+    right: bool  # within 2 cm and 10 degrees, modulo symmetry; never for foreign objects
 
 
-def measure_familiarity(aligner: Aligner, split: str, count: int) -> Familiarity:
-    """Familiarities over the first `count` samples of a set.
+def measure_familiarity(
+    aligner: Aligner, split: str, count: int, fields: tuple[str, ...] = DEFAULT_FIELDS
+) -> list[FamiliarityRow]:
+    """The questions about the first `count` samples of a set: four and more of each sample, the
+    kinds of FOREIGN_KINDS in turn; ways up are given in every other sample.
 
     Raises `IgaDrakeError` for an aligner whose estimates have no familiarity.
     """
-    own: list[float] = []
-    foreign: list[float] = []
+    rows = []
+    foreign = list(FOREIGN_KINDS)
     for index in progress(range(count), split):
-        points = make_sample(split, index, CONFIG).points
-        mixed = foreign_points(points, foreign_sample(split, index, CONFIG).points, index)
-        for asked, values in ((points, own), (mixed, foreign)):
-            query = Query.of(asked, random_pose(index))
-            familiarity = query.ask(aligner, index).familiarity
-            if familiarity is None:
+        sample, up = make_sample(split, index, CONFIG), bool(index % 2)
+        query = sample_query(sample, split, index, up=up)
+        kind = foreign[index % len(foreign)]
+        asked: dict[str, Query] = {
+            OWN: query,
+            kind: foreign_query(query, sample, kind, split, index),
+        } | {field: sample_query(sample, split, index, up=up, field=field) for field in fields}
+        for name, question in asked.items():
+            estimate = question.ask(aligner, index)
+            if estimate.familiarity is None:
                 raise IgaDrakeError(
-                    f"aligner {aligner.name}: gives no familiarity: use iga with a trained energy"
+                    f"aligner {aligner.name}: gives no familiarity: use iga with its landed weights"
                 )
-            values.append(familiarity)
-    return Familiarity(split, tuple(own), tuple(foreign))
+            right = name not in FOREIGN_KINDS and is_right(question, sample, estimate.poses[0])
+            rows.append(FamiliarityRow(index, name, float(estimate.familiarity.min()), right))
+    return rows
+
+
+def refused(rows: list[FamiliarityRow], kind: str, threshold: float) -> float:
+    """Share of the questions of a kind below a threshold; NaN where there are none."""
+    values = np.array([row.familiarity for row in rows if row.kind == kind])
+    return float((values < threshold).mean()) if len(values) else float("nan")
+
+
+def right_or_refused(rows: list[FamiliarityRow], kind: str, threshold: float) -> float:
+    """Share of the questions of a kind answered right or below a threshold."""
+    values = [row.right or row.familiarity < threshold for row in rows if row.kind == kind]
+    return float(np.mean(values)) if values else float("nan")
+
+
+def area(rows: list[FamiliarityRow]) -> float:
+    """Area under the ROC curve: how often a question about own objects looks more familiar than one
+    about foreign ones (Mann & Whitney 1947)."""
+    own = np.array([row.familiarity for row in rows if row.kind == OWN])
+    foreign = np.array([row.familiarity for row in rows if row.kind in FOREIGN_KINDS])
+    difference = np.subtract.outer(own, foreign)
+    return float(((difference > 0) + 0.5 * (difference == 0)).mean())
+
+
+def familiarity_table(split: str, rows: list[FamiliarityRow], threshold: float) -> str:
+    """What is refused, and what is answered wrong, of every kind of question, as text."""
+    lines = [
+        f"{split}: own objects look more familiar than foreign ones in {100 * area(rows):.1f} % of "
+        f"the comparisons; refused below {threshold:g}:",
+        "question       count  refused, %  right, %  right or refused, %",
+    ]
+    for kind in dict.fromkeys(row.kind for row in rows):
+        of = [row for row in rows if row.kind == kind]
+        line = f"{kind:<14} {len(of):5d} {100 * refused(rows, kind, threshold):11.1f}"
+        if kind not in FOREIGN_KINDS:
+            line += (
+                f" {100 * float(np.mean([row.right for row in of])):9.1f}"
+                f" {100 * right_or_refused(rows, kind, threshold):20.1f}"
+            )
+        lines.append(line)
+    return "\n".join(lines)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -99,25 +112,42 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sets", default=",".join(DEFAULT_SETS), help=f"default {','.join(DEFAULT_SETS)}"
     )
-    parser.add_argument("--count", type=int, default=100, help="samples of each set")
+    parser.add_argument("--count", type=int, default=100, help="samples of each set (default 100)")
+    parser.add_argument(
+        "--fields",
+        default=",".join(DEFAULT_FIELDS),
+        help=f"disturbances, of {', '.join(FIELD_KINDS)} (default {','.join(DEFAULT_FIELDS)})",
+    )
+    parser.add_argument(
+        "--threshold", type=float, default=0.5, help="least familiarity (default 0.5)"
+    )
     parser.add_argument("--json", action="store_true", help="every familiarity")
 
 
 def run(arguments: argparse.Namespace, aligner: Aligner | None = None) -> int:
-    """Prints the shares of refused own and accepted foreign contexts by threshold."""
-    names: Sequence[str] = arguments.sets.split(",")
+    """Prints what is refused of own, foreign and disturbed objects."""
+    names = arguments.sets.split(",")
     for name in names:
         sample_set(name)
+    fields = tuple(filter(None, arguments.fields.split(",")))
+    for field in fields:
+        if field not in FIELD_KINDS:
+            known = ", ".join(FIELD_KINDS)
+            raise IgaDrakeError(f"--fields: '{field}' is not known; one of: {known}")
     if arguments.count < 1:
         raise IgaDrakeError(f"--count {arguments.count}: at least 1 is needed")
+    if not 0 <= arguments.threshold <= 1:
+        raise IgaDrakeError(f"--threshold {arguments.threshold:g}: expected 0 to 1")
     aligner = aligner or IgaAligner()
     document = []
     for name in names:
-        found = measure_familiarity(aligner, name, arguments.count)
+        rows = measure_familiarity(aligner, name, arguments.count, fields)
         if arguments.json:
-            document.append(asdict(found) | {"area": found.area()})
+            document.append(
+                {"set": name, "area": area(rows), "questions": [asdict(row) for row in rows]}
+            )
         else:
-            print(found.table() + "\n", flush=True)
+            print(familiarity_table(name, rows, arguments.threshold) + "\n", flush=True)
     if arguments.json:
         print(json.dumps(document, indent=2))
     return 0

@@ -14,10 +14,11 @@ from scipy.ndimage import binary_dilation
 
 from iga_drake.errors import IgaDrakeError, check_bounds, check_range, shortened
 from iga_drake.geometry.voxels import voxelize
+from iga_drake.systems.camera_agreement import DepthView, disagreeing
 from iga_drake.systems.ports import Role
 
 # Depths (m) that a camera in a robot's cell can measure.
-_NEAREST, _FARTHEST = 0.01, 20.0
+NEAREST, FARTHEST = 0.01, 20.0
 _RIGID = 1e-4
 
 
@@ -44,6 +45,9 @@ class FusionConfig:
     maximum_age: float = 0.5
     # A camera that measures a depth in less than this share of its pixels counts as none.
     minimum_valid: float = 0.005
+    # A camera of whose points more than this share float where another camera sees through, or the
+    # other way round, counts as none: a pose is wrong (see `disagreeing`). 1: any pose will do.
+    maximum_disagreement: float = 0.05
 
     def check(self, where: str = "fusion") -> None:
         """Raises `ConfigError` for a value out of range."""
@@ -59,6 +63,7 @@ class FusionConfig:
                 "min_cluster": (1, 100_000),
                 "maximum_age": (1e-3, 3600.0),
                 "minimum_valid": (1e-6, 1.0),
+                "maximum_disagreement": (1e-6, 1.0),
             },
         )
         lower, upper = self.crop_lower, self.crop_upper
@@ -180,7 +185,8 @@ class PointCloudFusion(LeafSystem):
     crop box are dropped; the rest is unprojected into W, averaged by voxel, and specks are removed.
     Each camera is looked at by itself, and one with a problem gives no points: no image, an old one
     or one of the future, images of another size than the intrinsics', nearly no depth, depth in
-    other units, labels that are no roles, a pose that isn't rigid. All outputs come from one cached
+    other units, labels that are no roles, a pose that isn't rigid. Together they are looked at for
+    a pose that doesn't fit the others' (`camera_agreement.py`). All outputs come from one cached
     calculation and are pure functions of the inputs and of the time.
 
     .. pydrake_system::
@@ -191,6 +197,7 @@ class PointCloudFusion(LeafSystem):
         - <camera>.label_image
         - <camera>.pose
         - <camera>.time (optional)
+        - label_problems (optional)
         output_ports:
         - target_cloud
         - grasped_cloud
@@ -200,6 +207,8 @@ class PointCloudFusion(LeafSystem):
     - `<camera>.depth_image` (m), `<camera>.label_image` (roles), `<camera>.pose` (X_WC of the
       optical frame), `<camera>.time` (s, when the images were taken): as in the port contract, for
       each camera. Without a time, images are always new.
+    - `label_problems`: dict of "target", "grasped" -> why no pixel is labelled so, in words, from
+      whoever made the labels.
     - `target_cloud`, `grasped_cloud`: `PointCloud` with float32 xyz in W (m); empty if nothing is
       seen.
     - `camera_counts`: dict of camera name -> `CameraCounts`.
@@ -216,6 +225,7 @@ class PointCloudFusion(LeafSystem):
         config.check("FusionConfig")
         self._lower = np.asarray(config.crop_lower, dtype=np.float32)
         self._upper = np.asarray(config.crop_upper, dtype=np.float32)
+        self._infos = dict(cameras)
         self._rays = {name: pixel_rays(info) for name, info in cameras.items()}
         self._inputs = {
             name: (
@@ -226,6 +236,9 @@ class PointCloudFusion(LeafSystem):
             for name in cameras
         }
         self._times = {name: self.DeclareVectorInputPort(f"{name}.time", 1) for name in cameras}
+        self._label_problems = self.DeclareAbstractInputPort(
+            "label_problems", AbstractValue.Make({})
+        )
         self._fused = self.DeclareCacheEntry(
             description="fused clouds",
             value_producer=ValueProducer(
@@ -248,17 +261,23 @@ class PointCloudFusion(LeafSystem):
         parts: dict[int, list[np.ndarray]] = {Role.TARGET: [], Role.GRASPED: []}
         left = {role: _Left() for role in parts}
         counts = {}
+        images = {}
         for name, ports in self._inputs.items():
             depth, label, X_WC = (port.Eval(context) for port in ports)
             depth, label = depth.data[:, :, 0], label.data[:, :, 0]
-            valid = (depth >= _NEAREST) & (depth <= _FARTHEST)
+            valid = (depth >= NEAREST) & (depth <= FARTHEST)
             problem = (
                 self._time_problem(name, context)
                 or self._image_problem(name, depth, label, valid)
-                or _pose_problem(X_WC)
+                or pose_problem(X_WC)
             )
-            if problem:
-                counts[name] = CameraCounts(0, 0, 0, problem)
+            images[name] = depth, label, valid, X_WC
+            counts[name] = CameraCounts(0, 0, 0, problem)
+        sound = {name: image for name, image in images.items() if not counts[name].problem}
+        for name, problem in self._pose_conflicts(sound).items():
+            counts[name] = CameraCounts(0, 0, 0, problem)
+        for name, (depth, label, valid, X_WC) in images.items():
+            if counts[name].problem:
                 continue
             points, labels = self._unproject(name, depth, label, valid, X_WC, left)
             number = {}
@@ -270,6 +289,8 @@ class PointCloudFusion(LeafSystem):
                 int(np.count_nonzero(valid)), number[Role.TARGET], number[Role.GRASPED]
             )
         config, fused, losses = self._config, {}, {}
+        port = self._label_problems
+        unlabelled = port.Eval(context) if port.HasValue(context) else {}
         for role, name in ((Role.TARGET, "target"), (Role.GRASPED, "grasped")):
             points = np.hstack(parts[role] or [np.zeros((3, 0), np.float32)]).T
             fused[name] = np.zeros((0, 3), np.float32)
@@ -278,7 +299,38 @@ class PointCloudFusion(LeafSystem):
                 fused[name] = grid.centroids[~grid.specks(config.min_cluster)]
                 left[role].voxels, left[role].kept = len(grid.centroids), len(fused[name])
             losses[name] = left[role].words(name, config)
+            if left[role].labelled == 0:
+                losses[name] = unlabelled.get(name) or losses[name]
         value.set_value(FusedClouds(**fused, counts=counts, losses=losses))
+
+    def _pose_conflicts(
+        self,
+        images: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray, RigidTransform]],
+    ) -> dict[str, str]:
+        """Of cameras with images (depth, labels, which pixels are valid, X_WC), those whose pose
+        doesn't fit the others': why, in words."""
+        limit = self._config.maximum_disagreement
+        if limit >= 1 or len(images) < 2:
+            return {}
+        views = {
+            name: DepthView(
+                depth,
+                X_WC,
+                self._infos[name],
+                objects=valid & ((label == Role.TARGET) | (label == Role.GRASPED)),
+                scene=valid & (label != Role.ROBOT),
+            )
+            for name, (depth, label, valid, X_WC) in images.items()
+        }
+        return {
+            name: "measures what "
+            + " and ".join(
+                f"{other} sees through ({100 * share:.0f} % of it, or the other way round)"
+                for other, share in found.items()
+            )
+            + f"; {100 * limit:g} % are allowed: has it moved? Calibrate it again"
+            for name, found in disagreeing(views, limit).items()
+        }
 
     def _time_problem(self, name: str, context: Context) -> str:
         """Why this camera's images can't be of now, in words; empty if they can."""
@@ -286,20 +338,7 @@ class PointCloudFusion(LeafSystem):
         if not port.HasValue(context):
             return ""
         taken = float(port.Eval(context)[0])
-        age, limit = context.get_time() - taken, self._config.maximum_age
-        if not math.isfinite(taken):
-            return "has delivered no image yet: check the camera and its connection"
-        if age > limit:
-            return (
-                f"delivered its last image {age:.1f} s ago, at most {limit:g} s are allowed: check "
-                "the camera and its connection"
-            )
-        if age < -limit:
-            return (
-                f"says that its image was taken {-age:.1f} s from now: its time has to be in s on "
-                "the diagram's clock"
-            )
-        return ""
+        return time_problem(taken, context.get_time(), self._config.maximum_age)
 
     def _image_problem(
         self, name: str, depth: np.ndarray, label: np.ndarray, valid: np.ndarray
@@ -320,16 +359,16 @@ class PointCloudFusion(LeafSystem):
         share = np.count_nonzero(valid) / depth.size
         if share >= self._config.minimum_valid:
             return ""
-        far = depth[(depth > _FARTHEST) & (depth < np.inf)]
+        far = depth[(depth > FARTHEST) & (depth < np.inf)]
         if len(far) >= self._config.minimum_valid * depth.size:
             return (
-                f"delivers depths of {np.median(far):.4g} (median), m up to {_FARTHEST:g} are "
+                f"delivers depths of {np.median(far):.4g} (median), m up to {FARTHEST:g} are "
                 "expected: are they in mm?"
             )
-        near = depth[(depth > 0) & (depth < _NEAREST)]
+        near = depth[(depth > 0) & (depth < NEAREST)]
         if len(near) >= self._config.minimum_valid * depth.size:
             return (
-                f"delivers depths of {np.median(near):.4g} (median), m from {_NEAREST:g} on are "
+                f"delivers depths of {np.median(near):.4g} (median), m from {NEAREST:g} on are "
                 "expected: were they scaled twice?"
             )
         if share == 0:
@@ -400,7 +439,26 @@ class PointCloudFusion(LeafSystem):
         output.set_value(dict(self._fused.Eval(context).losses))
 
 
-def _pose_problem(X_WC: RigidTransform) -> str:
+def time_problem(taken: float, now: float, limit: float) -> str:
+    """Why an image that was `taken` then (s) can't be of `now`, give or take `limit`, in words;
+    empty if it can."""
+    age = now - taken
+    if not math.isfinite(taken):
+        return "has delivered no image yet: check the camera and its connection"
+    if age > limit:
+        return (
+            f"delivered its last image {age:.1f} s ago, at most {limit:g} s are allowed: check "
+            "the camera and its connection"
+        )
+    if age < -limit:
+        return (
+            f"says that its image was taken {-age:.1f} s from now: its time has to be in s on "
+            "the diagram's clock"
+        )
+    return ""
+
+
+def pose_problem(X_WC: RigidTransform) -> str:
     """Why a camera's pose is none, in words; empty if it is one."""
     R = X_WC.rotation().matrix()
     if not (np.isfinite(R).all() and np.isfinite(X_WC.translation()).all()):

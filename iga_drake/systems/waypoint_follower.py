@@ -17,6 +17,7 @@ from iga_drake.systems.ports import PANDA_JOINTS
 # Distance (m) or angle (rad) between desired and measured pose from which on the arm counts as not
 # having got there.
 _LEFT_BEHIND = 0.05
+_PATH_POINTS = 25  # of the output `path`
 
 
 @dataclass
@@ -89,6 +90,7 @@ class WaypointFollower(LeafSystem):
         - hand.opening
         - nominal_posture
         - status
+        - path
 
     - `target` (EndEffectorTarget, of sequence 0 before there is any): a new `sequence` starts a
       motion from the last commanded pose, or from the measured one if the arm didn't get there;
@@ -107,6 +109,8 @@ class WaypointFollower(LeafSystem):
     - `status` (FollowerStatus): the last target reached and settled, and the errors of the measured
       pose against the present target. A target out of reach is never reported; whoever sent it has
       to stop waiting.
+    - `path` (array (K, 3), m in W): where the present motion leads E, from its start to its end;
+      (0, 3) before the first target.
 
     All outputs are state, updated each time step; they stay where a measurement isn't finite.
     """
@@ -147,6 +151,9 @@ class WaypointFollower(LeafSystem):
         )
         self.DeclareAbstractOutputPort(
             "status", lambda: Value[object](FollowerStatus()), self._calc_status, ticket
+        )
+        self.DeclareAbstractOutputPort(
+            "path", lambda: Value[object](np.zeros((0, 3))), self._calc_path, ticket
         )
 
     def _update(self, context: Context, state: State) -> EventStatus:
@@ -314,3 +321,9 @@ class WaypointFollower(LeafSystem):
 
     def _calc_status(self, context: Context, output: AbstractValue) -> None:
         output.set_value(context.get_abstract_state(int(self._motion)).get_value().status)
+
+    def _calc_path(self, context: Context, output: AbstractValue) -> None:
+        path = context.get_abstract_state(int(self._motion)).get_value().path
+        shares = np.linspace(0.0, 1.0, _PATH_POINTS if path is not None else 0)
+        points = [path.pose(share).translation() for share in shares]
+        output.set_value(np.array(points).reshape(-1, 3))

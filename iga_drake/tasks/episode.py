@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from iga_drake.aligners.protocol import Aligner, PoseEstimate
-from iga_drake.aligners.registry import EXPERT, check_aligner
+from iga_drake.aligners.registry import EXPERT, ORACLE, PRIVILEGED, check_aligner
 from iga_drake.demonstrations.demonstration import (
     Demonstration,
     DemonstrationSet,
@@ -38,8 +38,10 @@ from iga_drake.station.make import make_station
 from iga_drake.station.panda.model import find_panda
 from iga_drake.station.scenario import Scenario
 from iga_drake.systems.messages import Cause
+from iga_drake.tasks.distractors import with_distractors
+from iga_drake.tasks.oracle import OracleInference
 from iga_drake.tasks.pose_error import pose_error_at
-from iga_drake.tasks.registry import make_task
+from iga_drake.tasks.registry import scenario_task
 from iga_drake.tasks.robot_diagram import RobotDiagram, build_robot_diagram
 from iga_drake.tasks.snapshots import Snapshot, TaskError, read_snapshot
 from iga_drake.tasks.task import Split, Task
@@ -83,10 +85,11 @@ class WaypointResult:
 
     def row(self) -> dict[str, Any]:
         """The result as plain JSON values."""
+        known = self.estimate.familiarity
         return {
             "name": self.name,
             "energy": self.energy,
-            "familiarity": self.estimate.familiarity,
+            "familiarity": None if known is None else known.tolist(),
             "position_error": self.position_error,
             "rotation_error": self.rotation_error,
             "inference_seconds": self.inference_seconds,
@@ -237,10 +240,10 @@ class Episode:
       scenario: how the diagram is wired.
       seed: decides scene, camera noise and the aligner's random choices.
       aligner: the name of an aligner, which runs in a worker process, or an aligner, which runs in
-        this one, or "expert"; default: the scenario's.
+        this one, or "expert" or "oracle"; default: the scenario's.
       split: whose objects: "test" (never demonstrated) or "demonstration".
       demonstrations: the aligner's context; default: the scenario's folder.
-      meshcat: where to show it.
+      meshcat: where to show it, and what the policy sees, infers and is about to do.
 
     Raises:
       IgaDrakeError: bad input. An episode that fails is a result, not an error.
@@ -258,14 +261,18 @@ class Episode:
     ) -> None:
         began = wall.perf_counter()
         self.scenario, self.seed, self.split = scenario, seed, split
-        self.task: Task = make_task(scenario.task.name)
+        self.task: Task = scenario_task(scenario)
         chosen = scenario.aligner.name if aligner is None else aligner
-        if chosen != EXPERT and demonstrations is None:
+        if chosen not in PRIVILEGED and demonstrations is None:
             folder = demonstrations_path(scenario)
             read = read_demonstrations(folder, task=self.task.name)
             demonstrations = read.first(min(scenario.context_size, len(read)))
-        self.demonstrations = None if chosen == EXPERT else demonstrations
-        self.scene = self.task.scene(seed + scenario.seeds.scene, split)
+        self.demonstrations = None if chosen in PRIVILEGED else demonstrations
+        self.scene = with_distractors(
+            self.task.scene(seed + scenario.seeds.scene, split),
+            scenario.distractors,
+            seed + scenario.seeds.scene,
+        )
         # Other draws of calibration and noise than any demonstration's with the same seed.
         draws = seed + (TEST_SEED_OFFSET if split == "test" else 0)
         self.inference = self._make_inference(chosen)
@@ -277,6 +284,7 @@ class Episode:
                 inference=self.inference,
                 demonstrations=self.demonstrations,
                 seed=draws,
+                meshcat=meshcat,
             )
             station = self.robot.station
             if station.HasSubsystemNamed("simulated"):  # behind the hardware station
@@ -298,6 +306,8 @@ class Episode:
     def _make_inference(self, aligner: str | Aligner) -> Inference:
         if aligner == EXPERT:
             return ExpertInference(lambda: self._expert(self.snapshot()))
+        if aligner == ORACLE:
+            return OracleInference(self.task, self.scene, self.snapshot)
         assert self.demonstrations is not None
         contexts = self.demonstrations.contexts
         if not isinstance(aligner, str):
@@ -393,14 +403,20 @@ class Episode:
         self._wall_seconds += wall.perf_counter() - began
         return self.status
 
-    def run(self, on_event: Callable[[str], None] | None = None) -> EpisodeResult:
+    def run(
+        self,
+        on_event: Callable[[str], None] | None = None,
+        *,
+        proceed: Callable[[], bool] | None = None,
+    ) -> EpisodeResult:
         """Goes on until it is over, and judges.
 
         Args:
           on_event: called with one line of text for each phase and with the verdict.
+          proceed: called before each step, may take its time; where it returns False the run ends.
         """
         shown = 0
-        while not self.over:
+        while not self.over and (proceed is None or proceed()):
             timeline = self.step().timeline
             if on_event:
                 for entry in timeline[shown:]:

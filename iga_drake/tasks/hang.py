@@ -29,6 +29,7 @@ from iga_drake.tasks.predicates import (
     Predicate,
     Touching,
     Upright,
+    Within,
 )
 from iga_drake.tasks.snapshots import ROBOT, TABLE
 from iga_drake.tasks.task import Split, Task
@@ -36,7 +37,8 @@ from iga_drake.tasks.task import Split, Task
 TARGET, HELD = "target", "grasped"
 SETTLED = 2.0  # s after the release
 TARGET_TILT = np.radians(10.0)
-REST, REST_TIME = 0.008, 0.5  # m moved in so many of the last seconds: it may swing a little
+REST, REST_TIME = 0.02, 0.5  # m moved in so many of the last seconds: it may swing on the hook
+AT_HOOK = 0.1  # m of the cap's centre of mass from the hook, for as long as it has been free
 SLIP = 0.015  # m in the hand, on the way
 CONTACT_FORCE = 10.0  # N; the cap is let go where it meets the hook
 RELEASE_OPENING = 0.03  # m
@@ -272,8 +274,8 @@ class Hang(Task):
         return tuple(X_WO[TARGET] @ X_TA @ X_AE for X_TA in self._poses(scene.truth.shapes))
 
     def goal(self, truth: SceneTruth) -> Predicate:
-        """The cap has been free of the robot for 2 s and rests at the end on the stand alone, which
-        stands upright; it didn't slip in the hand."""
+        """The cap has been free of the robot and at the hook for 2 s, and hangs at the end on the
+        stand alone, which stands upright; it didn't slip in the hand."""
         return AllOf(
             predicates=(
                 CarriedStill(object=HELD, slip=SLIP, otherwise="the cap slipped in the hand"),
@@ -297,6 +299,14 @@ class Hang(Task):
                     motion=REST,
                     for_last=REST_TIME,
                     otherwise="the cap still moves",
+                ),
+                Within(
+                    object=HELD,
+                    other=TARGET,
+                    frame="hook_seat",
+                    distance=AT_HOOK,
+                    for_last=SETTLED,
+                    otherwise="the cap is not at the hook",
                 ),
             )
         )

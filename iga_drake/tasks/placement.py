@@ -22,6 +22,8 @@ class WorkArea:
     upper: tuple[float, float]
     # Least and greatest distance (m) from W's z axis of the point that has to be in reach.
     reach: tuple[float, float]
+    # Least and greatest turn (rad) about W's z axis.
+    yaw: tuple[float, float] = (-np.pi, np.pi)
 
     def draw_pose(
         self,
@@ -30,7 +32,7 @@ class WorkArea:
         *,
         serves: Callable[[RigidTransform], bool] = lambda X_WO: True,
     ) -> RigidTransform:
-        """X_WO of an upright object on the table at any yaw, its origin in the rectangle.
+        """X_WO of an upright object on the table, its origin in the rectangle.
 
         Its point `p_OF` (m, default: the origin) is within reach and in front of the robot, and the
         pose `serves`. Raises `TaskError` where the rectangle has no such place.
@@ -39,7 +41,7 @@ class WorkArea:
             x, y = rng.uniform(self.lower, self.upper)
             if p_OF is None and not self._reaches(np.array([x, y])):
                 continue
-            R_WO = RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi))
+            R_WO = RotationMatrix.MakeZRotation(rng.uniform(*self.yaw))
             X_WO = RigidTransform(R_WO, [x, y, CLEARANCE])
             if (p_OF is None or self._reaches(X_WO.multiply(p_OF))) and serves(X_WO):
                 return X_WO

@@ -309,8 +309,9 @@ class HeldStill(MeasuredPredicate):
 
 @dataclass(frozen=True, kw_only=True)
 class CarriedStill(MeasuredPredicate):
-    """An object that is in the hand at the start moved in the end effector frame E by at most
-    `slip` (m), its centre of mass, for as long as nothing but the robot touched it."""
+    """An object moved in the end effector frame E by at most `slip` (m), its centre of mass, while
+    the hand carried it: the longest time in which the robot touched it and nothing else did. It
+    holds where it was never carried."""
 
     quantity = "carrying_slip"
     object: str
@@ -321,7 +322,7 @@ class CarriedStill(MeasuredPredicate):
         if self.for_last > 0:
             raise TaskError(
                 f"CarriedStill.for_last: {self.for_last} s found, none expected: it judges the way "
-                "from the start to the first touch"
+                "for which the hand carries it"
             )
 
     def judge(self, scene: Scene, snapshots: Sequence[Snapshot]) -> Verdict:
@@ -329,11 +330,14 @@ class CarriedStill(MeasuredPredicate):
             raise TaskError("CarriedStill: there are no snapshots: record the episode")
         _require_bodies(snapshots[0], self.object)
         held = frozenset((self.object, ROBOT))
-        alone = [
-            all(self.object not in pair or pair == held for pair in s.contacts) for s in snapshots
-        ]
-        count = alone.index(False) if False in alone else len(snapshots)
-        return self._judge_window(scene, snapshots[: max(count, 1)])
+        carried: list[Snapshot] = []  # the longest time so far
+        alone: list[Snapshot] = []  # since something else last touched it
+        for snapshot in snapshots:
+            touching = {pair for pair in snapshot.contacts if self.object in pair}
+            alone = [] if touching - {held} else [*alone, snapshot]
+            if len(alone) > len(carried) and any(held in s.contacts for s in alone):
+                carried = alone
+        return self._judge_window(scene, carried or snapshots[:1])
 
     def _values(self, scene: Scene, window: Sequence[Snapshot]) -> np.ndarray:
         return _slips(scene, window, self.object)

@@ -5,6 +5,8 @@ group `iga_drake.tasks`. A factory, such as a subclass of `Task`, is called with
 """
 
 from iga_drake.registry import Registry
+from iga_drake.station.scenario import Scenario
+from iga_drake.tasks.declared import DeclaredTask
 from iga_drake.tasks.task import Task, TaskError
 
 _REGISTRY: Registry[Task] = Registry(
@@ -24,3 +26,16 @@ def task_names() -> list[str]:
 def make_task(name: str) -> Task:
     """The task called `name`; `TaskError` lists the names that there are."""
     return _REGISTRY.factory(name)()
+
+
+def scenario_task(scenario: Scenario) -> Task:
+    """The task that a scenario declares or names. Raises `TaskError` where it is none."""
+    choice = scenario.task
+    if choice.declared is None:
+        return make_task(choice.name)
+    if choice.name in task_names():
+        raise TaskError(
+            f"task.name: '{choice.name}' is a task that there is already, and the scenario "
+            "declares one: give it another name"
+        )
+    return DeclaredTask(choice.name, choice.declared)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from iga_drake.demonstrations.demonstration import DemonstrationSet
@@ -17,6 +18,7 @@ from iga_drake.policy.iga_policy import IgaPolicy
 from iga_drake.policy.inference import Inference
 from iga_drake.policy.machine import PolicyMachine
 from iga_drake.policy.motion import TaskMotion
+from iga_drake.station.cameras.rgbd import camera_info
 from iga_drake.station.panda.model import gripper_cloud
 from iga_drake.station.panda.planning import make_panda_planning_robot
 from iga_drake.station.perception import add_fusion
@@ -27,6 +29,7 @@ from iga_drake.systems.forward_kinematics import ForwardKinematics
 from iga_drake.systems.fusion import PointCloudFusion
 from iga_drake.systems.supervisor import Supervisor
 from iga_drake.systems.waypoint_follower import WaypointFollower
+from iga_drake.viewing.policy_views import add_policy_views
 
 # Every wire of the robot but the cameras': "system.port" of the source -> those of
 # the sinks. The station's own ports have names with a dot as well: the system is the first part.
@@ -82,6 +85,7 @@ def build_robot_diagram(
     inference: Inference,
     demonstrations: DemonstrationSet | None,
     seed: int = 0,
+    meshcat: Meshcat | None = None,
 ) -> RobotDiagram:
     """Builds the whole robot around a station.
 
@@ -90,14 +94,16 @@ def build_robot_diagram(
       station: exports the port contract for the scenario's cameras.
       motion: what the task observes and how it moves around its waypoints.
       inference: finds the waypoints.
-      demonstrations: give the hand's openings; None takes them from `motion`.
+      demonstrations: give the hand's openings, and the geometric segmenter the target's shape;
+        None takes the openings from `motion`.
       seed: of the aligner, with `scenario.seeds.aligner` added.
+      meshcat: where to show what the policy sees, infers and is about to do; None shows nothing.
 
     Where the arm starts is not asked: everything begins with the joints as first measured.
     """
     builder = DiagramBuilder()
     builder.AddNamedSystem("station", station)
-    fusion = add_fusion(builder, station, scenario)
+    fusion = add_fusion(builder, station, scenario, demonstrations)
     robot = make_panda_planning_robot(scenario.table, scenario.planning)
     solver = PoseSolver(robot, config=scenario.planning)
     period = scenario.control.period
@@ -134,9 +140,39 @@ def build_robot_diagram(
         for sink in sinks:
             into, name = sink.split(".", 1)
             builder.Connect(systems[output].GetOutputPort(port), systems[into].GetInputPort(name))
+    if meshcat is not None:
+        _add_views(builder, scenario, systems, meshcat, motion, demonstrations)
     for camera in scenario.camera_names:
         port = f"{camera}.time"
         builder.Connect(station.GetOutputPort(port), systems["supervisor"].GetInputPort(port))
     diagram = builder.Build()
     diagram.set_name("robot")
     return RobotDiagram(diagram=diagram, station=station, fusion=fusion, policy=policy)
+
+
+def _add_views(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    systems: Mapping[str, Any],
+    meshcat: Meshcat,
+    motion: TaskMotion,
+    demonstrations: DemonstrationSet | None,
+) -> None:
+    """Adds the views of `viewing.policy_views`."""
+    policy = systems["policy"]
+    names = [policy.get_output_port(i).get_name() for i in range(policy.num_output_ports())]
+    outputs = {name: policy.GetOutputPort(name) for name in names}
+    outputs["pose_measured"] = systems["forward_kinematics"].GetOutputPort("pose")
+    outputs["path"] = systems["follower"].GetOutputPort("path")
+    for camera in scenario.camera_names:
+        for kind in ("color_image", "pose"):
+            outputs[f"{camera}.{kind}"] = systems["station"].GetOutputPort(f"{camera}.{kind}")
+    add_policy_views(
+        builder,
+        meshcat,
+        outputs=outputs,
+        motion=motion,
+        cameras={n: camera_info(camera.intrinsics) for n, camera in scenario.cameras.items()},
+        demonstrations=demonstrations,
+        period=scenario.visualization.publish_period,
+    )

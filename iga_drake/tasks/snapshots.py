@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactResults, MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context
 
 from iga_drake.errors import IgaDrakeError
@@ -29,7 +30,7 @@ class Snapshot:
     X_WO: Mapping[str, RigidTransform]
     X_WE: RigidTransform
     opening: float  # of the hand, m
-    # Unordered pairs of what touches: object names, ROBOT, TABLE (anything welded to the world).
+    # Unordered pairs of what touches: object names, ROBOT, TABLE (what the world itself holds).
     contacts: frozenset[frozenset[str]] = frozenset()
 
     def touches(self, first: str, second: str) -> bool:
@@ -58,17 +59,25 @@ def last_seconds(
 
 
 def read_snapshot(plant: MultibodyPlant, context: Context, panda: PandaModel) -> Snapshot:
-    """The state of a simulated plant whose free bodies are the scene's objects.
+    """The state of a simulated plant; what is neither the robot's nor the world's is an object's.
+
+    An object is the model instances called NAME or NAME::..., its pose that of its free body or, if
+    it is fixed to the world, of the first that is.
 
     `context` is the plant's own context inside the diagram's.
     """
     X_WO = {}
     body_names: dict[int, str] = {}
-    for index in plant.GetFloatingBaseBodies():
-        body = plant.get_body(index)
-        name = plant.GetModelInstanceName(body.model_instance())
-        body_names[int(index)] = name
-        X_WO[name] = plant.EvalBodyPoseInWorld(context, body)
+    for number in range(2, plant.num_model_instances()):  # 0 and 1: the world's and the default
+        instance = ModelInstanceIndex(number)
+        if instance == panda.instance:
+            continue
+        name = plant.GetModelInstanceName(instance).partition("::")[0]
+        for index in plant.GetBodyIndices(instance):
+            body_names[int(index)] = name
+            body = plant.get_body(index)
+            if body.is_floating_base_body() or (plant.IsAnchored(body) and name not in X_WO):
+                X_WO[name] = plant.EvalBodyPoseInWorld(context, body)
     for index in plant.GetBodyIndices(panda.instance):
         body_names[int(index)] = ROBOT
     results: ContactResults = plant.get_contact_results_output_port().Eval(context)

@@ -41,7 +41,8 @@ CONTACT_FORCE = 15.0  # N; the bowl is let go where it, or a finger, meets the o
 RELEASE_OPENING = (
     0.03  # m; more would push the outer finger, which points down, into the bowl below
 )
-_WORK_AREA = WorkArea(lower=(0.42, -0.25), upper=(0.65, 0.25), reach=(0.48, 0.68))
+# Where the lower bowl stands.
+WORK_AREA = WorkArea(lower=(0.42, -0.25), upper=(0.65, 0.25), reach=(0.48, 0.68))
 _GRIP_DEPTH = (0.004, 0.007)  # m from the rim to the middle of the pads
 _GRIP_ROLL = 0.1  # rad about the fingers' direction
 _COLORS = ((0.85, 0.83, 0.76), (0.2, 0.42, 0.6), (0.72, 0.35, 0.24), (0.35, 0.55, 0.4))
@@ -64,8 +65,9 @@ def grip(shape: ShapeInstance, *, depth: float, roll: float) -> tuple[RigidTrans
     return centred_grip(shape, X_OE)
 
 
-def _pair(seed: int) -> Mapping[str, ShapeInstance]:
-    """Draws bowls until one can be put into the other by a hand that holds its rim."""
+def nesting_bowls(seed: int, *, depth: float) -> Mapping[str, ShapeInstance]:
+    """Draws bowls until `HELD` can be put into `TARGET` by a hand that holds its rim: E is `depth`
+    (m) from the rim along the wall."""
     rng = np.random.default_rng(seed)
     for _ in range(TRIES):
         target = bowl.sample_parameters(rng)
@@ -74,13 +76,13 @@ def _pair(seed: int) -> Mapping[str, ShapeInstance]:
             continue
         if held["lean"] > 0.4:
             continue  # the hand would lean too far
-        shapes = {TARGET: bowl.build(target), HELD: bowl.build(held)}
-        X_OE, _ = grip(shapes[HELD], depth=_GRIP_DEPTH[1], roll=0.0)
         profiles = bowl.profile(held), bowl.profile(target)
         nested = nesting_height(*profiles)
-        release = release_height(*profiles, X_OE, (0.005, RELEASE_OPENING))
-        sunk = 1.0 - nested / bowl.profile(target).profile[:, 1].max()
-        if release - nested <= MAXIMUM_DROP and sunk > DEPTH_SHARE + 0.2:
+        if not 1.0 - nested / profiles[1].profile[:, 1].max() > DEPTH_SHARE + 0.2:
+            continue
+        shapes = {TARGET: bowl.build(target), HELD: bowl.build(held)}
+        X_OE, _ = grip(shapes[HELD], depth=depth, roll=0.0)
+        if release_height(*profiles, X_OE, (0.005, RELEASE_OPENING)) - nested <= MAXIMUM_DROP:
             return shapes
     raise TaskError(f"seed {seed}: no two bowls of {TRIES} fit into each other")
 
@@ -126,7 +128,7 @@ class Stack(Task):
 
     @staticmethod
     def make_shapes(seed: int) -> Mapping[str, ShapeInstance]:
-        return _pair(seed)
+        return nesting_bowls(seed, depth=_GRIP_DEPTH[1])
 
     def arrange(self, truth: SceneTruth, rng: np.random.Generator, mesh_folder: Path) -> Scene:
         shapes = truth.shapes
@@ -142,7 +144,7 @@ class Stack(Task):
             return write_sdf(shapes[name], mesh_folder, name=name, color=rgb, friction=0.7)
 
         objects = (
-            SceneObject(TARGET, "target", sdf(TARGET, 0), _WORK_AREA.draw_pose(rng)),
+            SceneObject(TARGET, "target", sdf(TARGET, 0), WORK_AREA.draw_pose(rng)),
             SceneObject(HELD, "grasped", sdf(HELD, 1), X_WO_held),
         )
         return holding_scene(

@@ -11,10 +11,15 @@ from scipy.spatial import ConvexHull
 from iga_drake.policy.motion import ObservationPlan, TaskMotion, WaypointMotion
 from iga_drake.shapes.families import FAMILIES
 from iga_drake.shapes.instance import ShapeInstance
-from iga_drake.shapes.sdf import write_sdf
+from iga_drake.shapes.sdf import Softness, write_sdf
 from iga_drake.station.panda.model import HOME_POSITION, gripper_cloud
 from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
-from iga_drake.tasks.holding import centred_grip, end_effector_pose, holding_scene
+from iga_drake.tasks.holding import (
+    centred_grip,
+    draw_parameters,
+    end_effector_pose,
+    holding_scene,
+)
 from iga_drake.tasks.marbles import make_marble, marble_object
 from iga_drake.tasks.placement import TRIES, WorkArea
 from iga_drake.tasks.predicates import (
@@ -36,7 +41,9 @@ SLIP = 0.02  # m that the brush may move in the hand
 # The bristles' front, along the dustpan's x from its edge, at the waypoints (m), and the gap (m)
 # below the bristles.
 FRONTS = (-0.10, 0.0, 0.045)
-GAP = 0.003
+GAP = 0.001
+# Bristles that are pressed down or against something bend: 5 mm give about 2 N.
+BRISTLES = Softness(modulus=5e3, stiffness=400.0, friction=0.4)
 _WORK_AREA = WorkArea(lower=(0.32, -0.35), upper=(0.68, 0.35), reach=(0.36, 0.72))
 # Distances (m) of E from the robot's axis at every waypoint.
 _HAND_REACH = (0.36, 0.66)
@@ -48,9 +55,21 @@ _GRIP_SHARE = 4 / 15
 _GRIP_ALONG = 0.004  # m along the handle
 _GRIP_ROLL = 0.05  # rad about the fingers' direction
 _HAND_GAP = 0.004  # m between the dustpan and whatever moves
-_MARBLE = (0.014, 0.016)  # m, diameter
-_MARBLE_DISTANCE = (0.03, 0.07)  # m from the dustpan's edge
-_MARBLE_SPACING = 0.0195  # m along it
+_MARBLE = (0.016, 0.018)  # m, diameter
+_MARBLE_DISTANCE = (0.03, 0.065)  # m from the dustpan's edge
+_MARBLE_SPACING = 0.021  # m along it
+# Of the families' ranges: bristles wide and level enough to push three marbles, a handle that the
+# hand gets around; a thin edge that marbles get over, walls that keep them.
+_BRUSH = {
+    "length": (0.10, 0.15),
+    "trim": (-0.09, 0.09),
+    "handle_length": (0.09, 0.17),
+    "handle_rise": (0.0, 0.5),
+    "neck": (0.75, 1.1),
+}
+_PAN = {"wall": (0.002, 0.0025), "depth": (0.032, 0.06), "hump": (0.0, 0.04)}
+_THINNEST = 0.014  # m, handle
+_BRUSH_MASS, _PAN_MASS = (0.04, 0.08), (0.3, 0.5)  # kg
 _COLORS = ((0.2, 0.42, 0.6), (0.72, 0.35, 0.24), (0.35, 0.55, 0.4), (0.5, 0.5, 0.52))
 _MARBLE_COLOR = (0.85, 0.75, 0.2)
 
@@ -107,19 +126,13 @@ def _pair(seed: int) -> dict[str, ShapeInstance]:
     """Draws brush and dustpan until the one goes into the other."""
     rng = np.random.default_rng(seed)
     for _ in range(TRIES):
-        held = FAMILIES["brush"].sample_parameters(rng)
-        target = FAMILIES["dustpan"].sample_parameters(rng)
-        # Bristles wide and level enough to push three marbles, a handle that the hand gets around.
-        held["trim"] *= 0.15
-        if held["length"] < 0.10 or held["handle_length"] < 0.09 or held["handle_rise"] < 0.0:
+        held = draw_parameters("brush", _BRUSH, rng)
+        target = draw_parameters("dustpan", _PAN, rng)
+        if held["handle_flatness"] * held["handle_width"] < _THINNEST:
             continue
-        if held["handle_flatness"] * held["handle_width"] < 0.014 or held["neck"] < 0.75:
-            continue
-        # An edge that marbles get over, walls that keep them, a handle that doesn't tip it over.
-        if target["wall"] > 0.0035 or target["depth"] < 0.032 or target["hump"] > 0.04:
-            continue
-        brush = FAMILIES["brush"].build(held).with_mass(rng.uniform(0.04, 0.08))
-        pan = FAMILIES["dustpan"].build(target).with_mass(rng.uniform(0.15, 0.35))
+        brush = FAMILIES["brush"].build(held).with_mass(rng.uniform(*_BRUSH_MASS))
+        pan = FAMILIES["dustpan"].build(target).with_mass(rng.uniform(*_PAN_MASS))
+        # The handle doesn't tip the dustpan over.
         stands = pan.mass_properties.p_OCcm[0] < 0.2 * target["length"] - 0.012
         # The brush has room between the walls.
         fits = swept_poses(brush, pan)[-1].translation()[2] < 0.01
@@ -200,9 +213,18 @@ class Sweep(Task):
         )
         colors = rng.permutation(len(_COLORS))
 
+        soft = dict.fromkeys(shapes[HELD].part_pieces("bristles"), BRISTLES)
+
         def sdf(name: str, color: int, friction: float) -> str:
             rgb = _COLORS[colors[color]]
-            return write_sdf(shapes[name], mesh_folder, name=name, color=rgb, friction=friction)
+            return write_sdf(
+                shapes[name],
+                mesh_folder,
+                name=name,
+                color=rgb,
+                friction=friction,
+                soft=soft if name == HELD else None,
+            )
 
         X_EO = X_OE.inverse()
         objects = [

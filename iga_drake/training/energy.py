@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from iga_drake.aligners.iga.aligner import default_weights
 from iga_drake.aligners.iga.energy import (
@@ -61,7 +61,6 @@ class EnergyTraining(RunConfig):
     validation_samples: int = 100
     problems: int = 500  # with demonstrations of one alignment
     modes_problems: int = 100  # with demonstrations of two
-    foreign_problems: int = 200  # that tell how foreign objects look
     # Weights of the two terms. Ranking made placing worse and ranked no better: it is only logged.
     placing: float = 1.0
     ranking: float = 0.0
@@ -234,49 +233,6 @@ def energy_errors(net: PairEnergyNet, problems: Problems) -> dict[str, float]:
     return result
 
 
-def familiarity_figures(net: PairEnergyNet, problems: Problems) -> Tensor:
-    """(n, FAMILIAR) of solved problems, double."""
-    rows = []
-    with torch.no_grad():
-        for n in range(len(problems)):
-            energy = net(problems.proposals(n))
-            X, _ = minimise(energy, also=problems.voted(n))
-            rows.append(energy.familiarity_features(X[0]))
-    return torch.stack(rows).double()
-
-
-def fit_familiarity(net: PairEnergyNet, own: Problems, foreign: Problems) -> dict[str, float]:
-    """Fits the logistic regression that tells own problems from foreign ones, both equally likely,
-    into `net`. Returns its rates on the problems that it was fitted to: own ones
-    refused and foreign ones accepted at one half."""
-    figures = [familiarity_figures(net, problems) for problems in (own, foreign)]
-    x = torch.cat(figures)
-    y = torch.cat([torch.full((len(f),), float(1 - k)) for k, f in enumerate(figures)]).double()
-    share = torch.where(y > 0.5, 0.5 / y.sum(), 0.5 / (1 - y).sum())
-    mean, deviation = x.mean(0), x.std(0).clamp_min(1e-6)
-    z = (x - mean) / deviation
-    weight = torch.zeros(z.shape[1] + 1, dtype=torch.float64, requires_grad=True)
-    optimizer = torch.optim.LBFGS([weight], max_iter=200, line_search_fn="strong_wolfe")
-
-    def closure() -> Tensor:
-        optimizer.zero_grad()
-        logits = z @ weight[:-1] + weight[-1]
-        loss = nn.functional.binary_cross_entropy_with_logits(logits, y, share, reduction="sum")
-        loss = loss + 0.5 / len(z) * weight[:-1].square().sum()  # unit prior
-        loss.backward()
-        return loss
-
-    optimizer.step(closure)  # type: ignore[no-untyped-call]
-    fitted = weight.detach()
-    net.familiar_weight.data.copy_(fitted[:-1] / deviation)
-    net.familiar_bias.data.copy_(fitted[-1] - (fitted[:-1] * mean / deviation).sum())
-    probability = torch.sigmoid(z @ fitted[:-1] + fitted[-1])
-    return {
-        "own_refused": float((probability[y > 0.5] < 0.5).double().mean()),
-        "foreign_accepted": float((probability[y < 0.5] >= 0.5).double().mean()),
-    }
-
-
 def train_energy(
     output: Path,
     *,
@@ -365,15 +321,6 @@ def train_energy(
             final = PairEnergyNet(model)
             final.load_state_dict({n: t.cpu() for n, t in run.ema.items()})
             results = {"validation": energy_errors(final, held_out.to("cpu"))}
-            if config.foreign_problems:
-                abroad = dataclasses.replace(maker, foreign=True)
-                foreign = make_problems(
-                    folder, ONE, config.foreign_problems, abroad, workers=workers
-                )
-                own = make_problems(folder, ONE, config.foreign_problems, maker, workers=workers)
-                results["familiarity"] = fit_familiarity(final, own, foreign)
-                for name in ("familiar_weight", "familiar_bias"):
-                    run.ema[name].copy_(getattr(final, name))
         card = run.save(**results)
     run.close()
     return card

@@ -19,7 +19,6 @@ from iga_drake.aligners.iga.energy import EnergyConfig, PairProposals, pair_prop
 from iga_drake.aligners.query import Query
 from iga_drake.checkpoint import load_checkpoint, save_checkpoint
 from iga_drake.dataset.alignment_error import CONFIG, equivalents, random_pose
-from iga_drake.dataset.foreign import foreign_points, foreign_sample
 from iga_drake.dataset.loader import sample_loader
 from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.dataset.splits import sample_set
@@ -52,17 +51,12 @@ class ProblemMaker:
 
     descriptor: Path
     model: EnergyConfig
-    # With test objects of another sample; what is right then has no meaning.
-    foreign: bool = False
 
     def __call__(self, split: str, index: int, config: SampleConfig | None) -> EnergyProblem:
         """Sample `index` of the set `split`."""
         aligner = _aligner(self.descriptor)
         sample = make_sample(split, index, config)
-        points = sample.points
-        if self.foreign:
-            points = foreign_points(points, foreign_sample(split, index, config).points, index)
-        query = Query.of(points, random_pose(index))
+        query = Query.of(sample.points, random_pose(index))
         explanation = aligner.explain(*query.clouds, seed=index)
         # To where both clouds' centroids are the origins.
         centre_A, centre_B = explanation.centres.numpy()
@@ -96,7 +90,7 @@ class ProblemMaker:
 @cache
 def _aligner(descriptor: Path) -> IgaAligner:
     torch.set_flush_denormal(False)  # the parts' deformer needs them in other processes
-    return IgaAligner(weights=descriptor, energy=None)
+    return IgaAligner(weights=descriptor, familiarity=None)
 
 
 def _padded(poses: np.ndarray, count: int) -> np.ndarray:
@@ -149,8 +143,7 @@ def make_problems(
     version = sha256(maker.descriptor.read_bytes())
     version.update(repr((maker.model.parts, maker.model.pairs, maker.model.combinations)).encode())
     version.update(repr(sample_set(split)).encode())
-    kind = "-foreign" if maker.foreign else ""
-    name = f"{split}{kind}-{version.hexdigest()[:12]}"
+    name = f"{split}-{version.hexdigest()[:12]}"
     shards = []
     for first in range(0, count, SHARD):
         path = folder / f"{name}-{first:06d}.safetensors"

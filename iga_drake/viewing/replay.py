@@ -1,6 +1,12 @@
 """Pictures of an episode and of demonstrations, in Meshcat and as pages that need no server."""
 
+import base64
+import gzip
+import importlib.resources
+import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import Cylinder, Meshcat, MeshcatParams, Rgba
@@ -10,9 +16,32 @@ from pydrake.perception import BaseField, Fields, PointCloud
 from iga_drake.demonstrations.demonstration import DemonstrationSet
 from iga_drake.files import write_text
 
-TARGET_COLOR = Rgba(0.10, 0.45, 0.85, 1.0)
+TARGET_COLOR = Rgba(0.10, 0.62, 0.95, 1.0)
 GRASPED_COLOR = Rgba(0.95, 0.55, 0.10, 1.0)
-PREDICTED_COLOR = Rgba(0.15, 0.70, 0.30, 1.0)
+PREDICTED_COLOR = Rgba(0.45, 0.85, 0.15, 1.0)
+OTHER_MODE_COLOR = Rgba(0.45, 0.35, 0.60, 1.0)
+PATH_COLOR = Rgba(0.85, 0.15, 0.45, 1.0)
+_FRAME_RATE = 16.0  # of recordings, 1/s: a page goes smoothly from one to the next
+EXPERT_COLOR = Rgba(0.95, 0.80, 0.10, 1.0)
+
+
+def _css(color: Rgba) -> str:
+    return "#" + "".join(f"{round(255 * c):02x}" for c in (color.r(), color.g(), color.b()))
+
+
+# What the colours of an episode's page mean.
+LEGEND = [
+    [words, _css(color)]
+    for words, color in (
+        ("target, observed", TARGET_COLOR),
+        ("grasped, observed", GRASPED_COLOR),
+        ("chosen pose, grasped carried there", PREDICTED_COLOR),
+        ("hand at the other modes", OTHER_MODE_COLOR),
+        ("way ahead", PATH_COLOR),
+        ("expert's pose (at the end)", EXPERT_COLOR),
+        ("contact forces, 5 cm for 10 N", Rgba(1.0, 0.0, 0.0)),
+    )
+]
 
 
 def quiet_meshcat() -> Meshcat:
@@ -46,31 +75,61 @@ def show_triad(meshcat: Meshcat, path: str, X_WF: RigidTransform, length: float 
     meshcat.SetTransform(path, X_WF)
 
 
-def show_prediction(
-    meshcat: Meshcat,
-    *,
-    target: np.ndarray,  # (Q, 3) in W
-    grasped_E: np.ndarray,  # (P, 3) in E
-    X_WE: RigidTransform | None = None,
-    path: str = "perception",
-) -> None:
-    """Shows the target cloud and, where a pose was predicted, the grasped cloud carried there."""
-    meshcat.SetCameraPose(np.array([1.5, -0.9, 0.8]), np.array([0.35, 0.0, 0.2]))
-    show_cloud(meshcat, f"{path}/target cloud", target, TARGET_COLOR)
-    if X_WE is not None:
-        show_triad(meshcat, f"{path}/predicted pose", X_WE)
-        if len(grasped_E):
-            show_cloud(
-                meshcat,
-                f"{path}/grasped cloud at the predicted pose",
-                (X_WE @ np.asarray(grasped_E).T).T,
-                PREDICTED_COLOR,
-            )
+def begin_recording(meshcat: Meshcat, *, live: bool) -> None:
+    """Records from now on, and forgets what was recorded before; `live`: it is seen as well."""
+    meshcat.DeleteRecording()
+    meshcat.StartRecording(frames_per_second=_FRAME_RATE, set_visualizations_while_recording=live)
 
 
-def write_html(meshcat: Meshcat, path: Path | str) -> None:
-    """Writes all that Meshcat shows, recordings included, as one page; whole or not at all."""
-    write_text(Path(path), meshcat.StaticHtml())
+def end_recording(meshcat: Meshcat) -> None:
+    """Ends the recording and gives it to the page, which doesn't play it unasked."""
+    meshcat.StopRecording()
+    meshcat.get_mutable_recording().set_autoplay(False)
+    meshcat.PublishRecording()
+
+
+def replay_html(meshcat: Meshcat, episode: Mapping[str, Any]) -> str:
+    """A page that needs no server: the recording of an episode, with its verdict and errors, a
+    legend, and a time line of its phases to move along.
+
+    Args:
+      meshcat: holds the published recording.
+      episode: plain JSON values, as `EpisodeResult.row` gives them.
+    """
+    meshcat.Flush()
+    page = meshcat.StaticHtml()
+    data = json.dumps({**episode, "legend": LEGEND}).replace("</", "<\\/")
+    overlay = importlib.resources.files(__package__).joinpath("timeline.html").read_text("utf-8")
+    head, body, rest = page.rpartition("</body>")
+    data = f'<script type="application/json" id="episode">{data}</script>'
+    return packed_page("\n".join((head, data, overlay, body + rest)))
+
+
+def packed_page(page: str) -> str:
+    """A page that unpacks itself into `page` when it is opened, of about half its size."""
+    packed = base64.b64encode(gzip.compress(page.encode(), compresslevel=6, mtime=0)).decode()
+    return _UNPACKING.replace("PACKED", packed)
+
+
+_UNPACKING = """<!doctype html>
+<html><head><meta charset="utf-8"></head><body>
+<script type="text/plain" id="packed">PACKED</script>
+<script>
+(async () => {
+  if (typeof DecompressionStream === "undefined") {
+    document.body.textContent = "This page needs a browser of 2023 or newer.";
+    return;
+  }
+  const packed = atob(document.getElementById("packed").textContent);
+  const bytes = Uint8Array.from(packed, (letter) => letter.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const page = await new Response(stream).text();
+  document.open();
+  document.write(page);
+  document.close();
+})();
+</script></body></html>
+"""
 
 
 def show_demonstrations(
@@ -106,7 +165,7 @@ def write_or_serve(meshcat: Meshcat, html: Path | None) -> None:
     """Writes what is shown as a page, or prints its address and serves until Enter is pressed."""
     if html is not None:
         meshcat.Flush()
-        write_html(meshcat, html)
+        write_text(html, meshcat.StaticHtml())
         print(f"written: {html}")
         return
     print(f"open {meshcat.web_url()} in a browser; press Enter to end", flush=True)

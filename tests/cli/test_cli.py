@@ -56,15 +56,16 @@ def scenario_with(tmp_path: Path, demonstrations: Path) -> str:
 
 
 def test_aligners_are_checked_first(capsys):
-    assert "unknown aligner 'oracle'" in refused(capsys, "simulate", "grasp", "--aligner", "oracle")
+    assert "unknown aligner 'orakel'" in refused(capsys, "simulate", "grasp", "--aligner", "orakel")
     line = refused(capsys, "simulate", "grasp", "--aligner", "icp", "--option", "speed=3")
     assert "{'speed': 3}: 'icp' does not take them" in line
     line = refused(capsys, "simulate", "grasp", "--aligner", "icp", "--option", "iga.speed=3")
     assert "'iga' is not among the aligners asked for: icp" in line
     line = refused(capsys, "simulate", "grasp", "--aligner", "icp", "--option", "starts=null")
     assert "a number or text is expected" in line
-    line = refused(capsys, "simulate", "grasp", "--aligner", "expert", "--option", "speed=3")
-    assert "the expert takes none" in line
+    for name in ("expert", "oracle"):
+        line = refused(capsys, "simulate", "grasp", "--aligner", name, "--option", "speed=3")
+        assert f"the {name} takes none" in line
 
 
 @pytest.mark.parametrize(
@@ -121,7 +122,7 @@ def test_the_echo_of_bad_input_has_an_end(capsys, tmp_path: Path):
     assert len(refused(capsys, "simulate", "y" * 100_000)) < 2000
 
 
-@pytest.mark.parametrize("option", ["--html", "--result"])
+@pytest.mark.parametrize("option", ["--html", "--result", "--png"])
 def test_outputs_are_checked_before_the_work(capsys, tmp_path: Path, option: str):
     notes = tmp_path / "notes.json"
     notes.write_text("my notes")
@@ -196,8 +197,8 @@ def test_view_writes_a_page(capsys, tmp_path: Path):
 
 
 def test_evaluate_refuses_what_it_does_not_know(capsys):
-    line = refused(capsys, "evaluate", "tasks", "--aligner", "oracle")
-    assert "unknown aligner 'oracle': one of: " in line and "iga-paper" in line
+    line = refused(capsys, "evaluate", "tasks", "--aligner", "orakel")
+    assert "unknown aligner 'orakel': one of: " in line and "iga-paper" in line
     assert "juggle: no such file" in refused(capsys, "evaluate", "tasks", "--tasks", "juggle")
     assert "at least 1" in refused(capsys, "evaluate", "tasks", "--trials", "0")
     assert "--tasks: empty" in refused(capsys, "evaluate", "tasks", "--tasks", ",")
@@ -271,3 +272,40 @@ def test_exit_status_follows_the_verdict(monkeypatch, tmp_path: Path):
     assert cli.main([*command, "--seed", "1"]) == cli.SUCCESS
     assert json.loads(path.read_text())["success"] is True
     assert cli.main([*command, "--seed", "2"]) == cli.FAILURE
+
+
+def test_a_live_run_without_a_terminal_neither_waits_nor_stays(monkeypatch, capsys):
+    """A restart, here asked for once, begins again with the next seed."""
+    from types import SimpleNamespace
+
+    from iga_drake.tasks import episode
+    from iga_drake.viewing.meshcat import RunButtons
+
+    seeds, rates = [], []
+
+    class FakeEpisode:
+        def __init__(self, scenario, *, seed, split, meshcat):
+            self.task, self.seed = make_task(scenario.task.name), seed
+            seeds.append(seed)
+            self.simulator = SimpleNamespace(
+                set_target_realtime_rate=rates.append, ResetStatistics=lambda: None
+            )
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def run(self, on_event, proceed):
+            assert proceed() is (self.seed == 4)
+            return episode.EpisodeResult(
+                task="grasp", aligner="icp", seed=self.seed, split="test", scenario="", success=True
+            )
+
+    monkeypatch.setattr(episode, "Episode", FakeEpisode)
+    monkeypatch.setattr(RunButtons, "restarts", property(lambda self: seeds == [3]))
+    command = ["simulate", "grasp", "--aligner", "icp", "--meshcat", "--seed", "3"]
+    assert cli.main([*command, "--realtime", "0.5"]) == cli.SUCCESS
+    assert seeds == [3, 4] and rates == [0.5, 0.5]
+    assert "meshcat: http://localhost:" in capsys.readouterr().out

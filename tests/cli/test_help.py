@@ -113,3 +113,7 @@ def test_a_missing_extra_is_named_with_what_to_type(
     assert cli.main(arguments) == cli.BAD_INPUT
     assert "igl is not installed: pip install 'iga-drake[dif-net]'" in capsys.readouterr().err
     assert missing_extra(ImportError("broken", name="numpy")) == ""
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    for verb in (["simulate", "grasp"], ["evaluate", "tasks", "--tasks", "grasp"]):
+        assert cli.main([*verb, "--aligner", "icp"]) == cli.BAD_INPUT
+        assert "pip install 'iga-drake[icp]'" in capsys.readouterr().err

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from demonstration_fakes import NAMES, make_demonstration, make_set
 from safetensors.numpy import load_file, save_file
+from scipy.spatial import cKDTree
 
 from iga_drake.demonstrations.demonstration import (
     DemonstrationError,
@@ -102,6 +103,22 @@ def test_landed_demonstrations_are_upright_as_their_task_says(task: str):
         assert alignment.grasped_up is None
 
 
+@pytest.mark.parametrize("task", ["pick_and_stack", "pick_and_insert"])
+def test_landed_demonstrations_see_the_same_object_before_and_after_it_is_taken(task: str):
+    """What stood on the table is in the hand where the hand closed on it."""
+    read = read_demonstrations(models_dir() / "demonstrations" / task, task=task)
+    assert len(read) == 3
+    for demonstration in read.demonstrations:
+        assert demonstration.relations == make_task(task).motion.relations
+        pick, place = demonstration.waypoints[:2]
+        stood, held = (demonstration.observations[n] for n in (pick.target, place.grasped))
+        assert (stood.role, stood.frame, held.role, held.frame) == ("grasped", "W", "grasped", "E")
+        assert stood.time < held.time and pick.opening < 0.01
+        X_EW = np.linalg.inv(pick.X_WE)
+        there = stood.points @ X_EW[:3, :3].T + X_EW[:3, 3]
+        assert np.median(cKDTree(there).query(held.points)[0]) < 0.006
+
+
 def test_a_trajectory_may_be_missing(tmp_path: Path):
     bare = DemonstrationSet("grasp", (make_demonstration(trajectory=None),))
     write_demonstrations(tmp_path / "bare", bare)
@@ -171,6 +188,26 @@ def test_truncated_manifest_is_refused(folder: Path, keep: int):
 def test_foreign_manifests_are_refused(folder: Path, changes: dict, message: str):
     edit_manifest(folder, **changes)
     with pytest.raises(DemonstrationError, match=message):
+        read_demonstrations(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"grasped": "thing"}, "'thing' is in frame W, E expected: relate .* in the hand"),
+        ({"target": "gripper"}, "'gripper' is in frame E, W expected: relate .* where it stood"),
+        (
+            {"grasped": "it"},
+            r"relates the grasped observation 'it', the demonstration has \['goal'",
+        ),
+    ],
+)
+def test_stages_that_relate_the_wrong_clouds_are_refused(folder: Path, change: dict, message: str):
+    """The second of two stages: the thing as it stood on the table, say, not as it was held."""
+    manifest = json.loads((folder / MANIFEST).read_text())
+    manifest["demonstrations"][1]["waypoints"][1] |= change
+    edit_manifest(folder, demonstrations=manifest["demonstrations"])
+    with pytest.raises(DemonstrationError, match=f"demonstration_1.*waypoint 'place': .*{message}"):
         read_demonstrations(folder)
 
 

@@ -48,10 +48,28 @@ def test_markdown_has_whole_rows() -> None:
     results = [result(0), result(1, "contact")]
     lines = markdown_summary(results, compare_trials([result(1)], results)).splitlines()
     tables = [line for line in lines if line.startswith("|")]
-    assert "| stack | iga | 1 of 2 | 9 to 91 % |" in tables[2]
+    assert tables[:3] == ["| scenario | iga |", "|---|---|", "| stack | 1 of 2 |"]
+    assert "| stack | iga | 1 of 2 | 9 to 91 % | contact 1 |" in tables[5]
     widths = [line.replace("\\|", "").count("|") for line in tables]
-    assert widths == [8] * 3 + [6] * 3
+    assert widths == [3] * 3 + [12] * 3 + [6] * 3
     assert any("1 broke" in line for line in lines) and lines[-1].startswith("- broke stack iga")
+
+
+def test_markdown_has_scenarios_by_aligners_and_mean_times() -> None:
+    results = [
+        result(0, simulated_seconds=10.0),
+        result(1, "contact", simulated_seconds=13.0),
+        result(2, "contact"),
+        result(0, aligner="expert"),
+        result(0, scenario="hang"),
+    ]
+    lines = markdown_summary(results).splitlines()
+    assert lines[:4] == [
+        "| scenario | iga | expert |", "|---|---|---|", "| stack | 1 of 3 | 1 of 1 |",
+        "| hang | 1 of 1 | - |",
+    ]  # fmt: skip
+    stack = next(line for line in lines if line.startswith("| stack | iga |"))
+    assert "| contact 2 |" in stack and stack.endswith("| 11.50 s | 2.50 s | - |")
 
 
 def test_changes_are_told_trial_by_trial() -> None:

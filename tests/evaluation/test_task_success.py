@@ -150,6 +150,7 @@ def test_a_cluster_gives_the_same_rows(monkeypatch):
     import ray
 
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("RAY_raylet_start_wait_time_s", "180")  # on a busy machine
     arguments = ("grasp", "--set=task.time_limit=0.1", "--set=plant.time_step=0.01")
     trials = make_trials([3, 4], arguments=arguments, aligner="expert")
     ray.init(num_cpus=1, include_dashboard=False, object_store_memory=80 * 2**20)

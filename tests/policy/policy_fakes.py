@@ -55,7 +55,7 @@ class FakeAligner:
     name: str = "fake"
     poses: tuple[RigidTransform, ...] = (X_GOAL,)
     error: BaseException | None = None
-    familiarity: float | None = None
+    familiarity: tuple[float, float] | None = None
     calls: list = field(default_factory=list)
     ups: list = field(default_factory=list)
 

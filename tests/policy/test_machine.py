@@ -150,6 +150,24 @@ def test_pick_and_place_goes_back_from_moving_to_observing():
     assert openings == [0.08, 0.08, 0.08, 0.01, 0.01, 0.01, 0.0, 0.0, 0.06, 0.06]
 
 
+@pytest.mark.parametrize("again", [False, True])
+def test_postures_begin_where_the_arm_will_be(again: bool):
+    """At its own joints, or at those of the waypoint before where that is still to be followed."""
+    asked = []
+
+    def solve(X_WE, near):
+        asked.append(near[0])
+        return near + 1.0
+
+    twice = (GRASP.waypoints[0], replace(GRASP.waypoints[0], name="again"))
+    motion = replace(GRASP, waypoints=twice) if again else PICK_AND_PLACE
+    memory, _ = run(make_machine(motion, solve=solve), FakeInputs())
+    assert memory.status.phase is Phase.DONE
+    # Before, at and after each waypoint; the fake arm's joints are always at 0.
+    second = [2.0, 3.0, 4.0] if again else [0.0, 1.0, 2.0]
+    assert asked == [0.0, 1.0, 2.0, *second]
+
+
 def test_waypoints_whose_clouds_are_known_are_inferred_before_any_motion():
     both = TaskMotion(
         observations=GRASP.observations,
@@ -269,15 +287,18 @@ def test_poses_that_are_not_finite_are_refused():
 
 def test_objects_that_look_like_none_of_the_demonstrations_are_refused_where_asked():
     for familiarity, least, refused in (
-        (0.2, 0.0, False), (0.2, 0.5, True), (None, 0.5, False),
+        ((0.9, 0.2), 0.0, ""), ((0.9, 0.2), 0.5, "the target object looks like none"),
+        ((0.2, 0.9), 0.5, "the grasped object looks like none"), ((0.5, 0.5), 0.5, ""),
+        (None, 0.5, ""),
     ):  # fmt: skip
         aligner = FakeAligner(familiarity=familiarity)
         machine = make_machine(aligner=aligner, minimum_familiarity=least)
         memory, targets = run(machine, FakeInputs())
-        assert (memory.status.phase == Phase.REFUSED) == refused
+        assert (memory.status.phase == Phase.REFUSED) == bool(refused)
         if refused:
             assert memory.status.cause == "alignment" and list(targets) == [0]
-            assert f"familiarity {familiarity:.2f}, 0.5 is asked for" in memory.status.reason
+            assert refused in memory.status.reason and memory.status.reason.count("looks") == 1
+            assert "(familiarity 0.20); at least 0.5 is asked for" in memory.status.reason
 
 
 def test_unreachable_poses_are_refused():

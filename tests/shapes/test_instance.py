@@ -45,6 +45,16 @@ def test_part_vertices_are_those_of_the_part_s_faces() -> None:
         mug.part_vertices("handle", "lid")
 
 
+def test_part_pieces_are_those_that_lie_in_the_part() -> None:
+    brush = FAMILIES["brush"].build(FAMILIES["brush"].sample_parameters(np.random.default_rng(0)))
+    (index,) = brush.part_pieces("bristles")
+    bristles = brush.part_vertices("bristles")
+    piece = np.unique(brush.convex_pieces[index], axis=0)
+    np.testing.assert_array_equal(piece, np.unique(bristles, axis=0))
+    pieces = [brush.part_pieces(name) for name in brush.part_names]
+    assert sorted(i for part in pieces for i in part) == list(range(len(brush.convex_pieces)))
+
+
 def test_with_mass_scales_mass_and_inertia() -> None:
     light, heavy = _box(), _box().with_mass(6.0)
     assert heavy.mass_properties.mass == pytest.approx(6.0)

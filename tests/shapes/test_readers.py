@@ -1,6 +1,7 @@
 """Readers of mesh collections: broken meshes are reported and skipped, good ones are cleaned."""
 
 import json
+import re
 from importlib import metadata
 from pathlib import Path
 
@@ -435,3 +436,53 @@ def test_split_is_fixed_about_the_right_share_and_grows() -> None:
     assert split_of("mug/025_mug") == "train" and split_of("pear/016_pear") == "held_out"
     with pytest.raises(ShapeError, match="held_out"):
         split_of("mug/a1", held_out=1.5)
+
+
+def test_indices_of_an_obj_may_count_back(tmp_path: Path) -> None:
+    """Two parts, each with the indices of its own last vertices: nothing of the first is lost."""
+    parts = [trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.04, 0.02, 0.06))]
+    parts[1].apply_translation([0.07, 0, 0])
+    absolute, relative, start = "", "", 1
+    for part in parts:
+        vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in part.vertices)
+        count = len(part.vertices)
+        absolute += vertices + "".join(f"f {a} {b} {c}\n" for a, b, c in part.faces + start)
+        relative += vertices + "".join(f"f {a} {b} {c}\n" for a, b, c in part.faces - count)
+        start += count
+    for name, text in (("absolute", absolute), ("relative", relative)):
+        (tmp_path / f"{name}.obj").write_text(text)
+    one, other = read_meshes(list_folder(tmp_path))
+    np.testing.assert_array_equal(one.vertices, other.vertices)
+    np.testing.assert_array_equal(one.faces, other.faces)
+    assert len(other.vertices) == 16
+
+
+def test_the_axis_that_points_up_may_be_said(tmp_path: Path) -> None:
+    trimesh.creation.box((0.06, 0.2, 0.08)).export(tmp_path / "bottle.obj")
+    for up, extents in (
+        ("", (0.06, 0.2, 0.08)),
+        ("y", (0.06, 0.08, 0.2)),
+        ("x", (0.08, 0.2, 0.06)),
+    ):
+        (shape,) = read_meshes(list_folder(tmp_path), cleaning=MeshCleaning(up=up))
+        np.testing.assert_allclose(shape.mesh.extents, extents, atol=1e-9)
+    with pytest.raises(ShapeError, match="up = 'w', must be one of x, y, z"):
+        MeshCleaning(up="w")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "reason"),
+    [
+        ("a.obj", "<!DOCTYPE html><html>404</html>", "web page.*download"),
+        ("a.stl", "version https://git-lfs.github.com/spec/v1\nsize 1\n", "Git LFS.*lfs pull"),
+        ("a.stl", "solid x\n facet normal 0 0 1\n  outer loop\n   vertex 0.04", "cut short"),
+    ],
+)
+def test_what_is_no_mesh_is_called_what_it_is(
+    tmp_path: Path, name: str, text: str, reason: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    report = ReadReport()
+    assert not list(read_meshes(list_folder(tmp_path), report=report))
+    (found,) = report.skipped.values()
+    assert re.search(reason, found)

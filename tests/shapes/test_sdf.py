@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from pydrake.geometry import HalfSpace, Role, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
@@ -19,7 +20,7 @@ from pydrake.systems.framework import DiagramBuilder
 from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.families import FAMILIES, bowl, pan
 from iga_drake.shapes.instance import ShapeInstance
-from iga_drake.shapes.sdf import write_sdf, write_sdf_file
+from iga_drake.shapes.sdf import Softness, write_sdf, write_sdf_file
 
 
 @pytest.fixture(params=[bowl, pan], ids=["bowl", "pan"])
@@ -84,6 +85,42 @@ def test_normals_of_the_visual_mesh_look_outwards_and_keep_creases(
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-4)
     cosine = np.einsum("fkd,fd->fk", normals[faces[..., 1] - 1], instance.mesh.face_normals)
     assert cosine.min() > np.cos(np.radians(40.0))
+
+
+def _sunk(instance: ShapeInstance, folder: Path, **options: object) -> float:
+    """How deep (m) a shape that stands on the ground sinks into it within 0.6 s."""
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 0.002)
+    plant.RegisterCollisionGeometry(
+        plant.world_body(), RigidTransform(), HalfSpace(), "ground", CoulombFriction(0.8, 0.8)
+    )
+    Parser(plant).AddModelsFromString(write_sdf(instance, folder, name="thing", **options), "sdf")
+    plant.Finalize()
+    simulator = Simulator(builder.Build())
+    context = plant.GetMyContextFromRoot(simulator.get_context())
+    simulator.AdvanceTo(0.6)
+    return -float(plant.EvalBodyPoseInWorld(context, plant.GetBodyByName("thing")).translation()[2])
+
+
+def test_a_soft_piece_sinks_by_weight_over_stiffness(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
+    shape = ShapeInstance(
+        family="ball",
+        parameters={},
+        vertices=ball.vertices + [0.0, 0.0, 0.04],
+        faces=ball.faces,
+        part_labels=np.zeros(len(ball.faces), dtype=int),
+        part_names=("ball",),
+        convex_pieces=(ball.vertices + [0.0, 0.0, 0.04],),
+    ).with_mass(0.1)
+    soft = Softness(modulus=5e3, stiffness=400.0, friction=0.3)
+    assert _sunk(shape, tmp_path, soft={0: soft}) == pytest.approx(0.1 * 9.81 / 400.0, rel=0.1)
+    assert _sunk(shape, tmp_path) < 2e-4
+    plant, scene_graph = _plant(write_sdf(shape, tmp_path, name="thing", soft={0: soft}))
+    (piece,) = plant.GetCollisionGeometriesForBody(plant.GetBodyByName("thing"))
+    properties = scene_graph.model_inspector().GetProximityProperties(piece)
+    assert properties.GetProperty("hydroelastic", "hydroelastic_modulus") == 5e3
+    assert properties.GetProperty("material", "coulomb_friction").static_friction() == 0.3
 
 
 def test_a_shape_is_written_once_and_shared(instance: ShapeInstance, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.multibody.plant import MultibodyPlantConfig
 
@@ -19,10 +19,11 @@ from iga_drake.station.scenario import (
 )
 
 SHIPPED = (
-    "grasp", "stack", "hang", "insert", "pour", "sweep", "field", "hardware", "one_of_everything"
+    "grasp", "stack", "hang", "insert", "pour", "sweep", "pick_and_stack", "pick_and_insert",
+    "field", "hardware", "one_of_everything",
 )  # fmt: skip
 # Time steps (s) other than the default.
-TIME_STEPS = {"pour": 0.0025, "sweep": 0.005}
+TIME_STEPS = {"pour": 0.0025, "sweep": 0.005, "pick_and_stack": 0.004, "pick_and_insert": 0.004}
 
 
 def _load(tmp_path, text: str) -> Scenario:
@@ -259,7 +260,6 @@ def test_every_number_has_an_upper_bound_and_is_named(key: str):
 
 
 @given(st.sampled_from(NUMBERS), st.sampled_from(WILD) | st.floats() | st.integers())
-@settings(max_examples=60)
 def test_any_value_is_accepted_within_its_bounds_or_refused_by_name(key: str, value):
     text = str(value).lower() if value is None or isinstance(value, float) else f"{value}"
     try:
@@ -281,7 +281,6 @@ NODES = st.recursive(
 
 
 @given(NODES)
-@settings(max_examples=60)
 def test_any_file_is_read_or_refused(node):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scenario.yaml"

@@ -10,6 +10,7 @@ def test_times_every_contender_in_one_run(capsys):
     assert set(result) == {
         "ours, whole images",
         "ours, objects",
+        "geometric labels",
         "Drake, whole images",
         "Open3D, whole images",
     }

@@ -7,46 +7,79 @@ from scipy.stats import mannwhitneyu
 
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.errors import IgaDrakeError
-from iga_drake.studies.familiarity import Familiarity, run
+from iga_drake.studies.familiarity import (
+    FamiliarityRow,
+    area,
+    familiarity_table,
+    refused,
+    right_or_refused,
+    run,
+)
 
 
-class Asked:
-    """An aligner that gives these familiarities in turn."""
+class Given:
+    """An aligner that gives these familiarities in turn, of the less familiar object."""
 
-    name = "asked"
+    name = "given"
 
     def __init__(self, *values: float | None):
         self.values = list(values)
 
     def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
-        return PoseEstimate(np.eye(4)[None], np.zeros(1), np.ones(1), self.values.pop(0))
+        value = self.values.pop(0)
+        known = None if value is None else (1.0, value)
+        return PoseEstimate(np.eye(4)[None], np.zeros(1), np.ones(1), known)
 
 
 def _arguments(**changes) -> argparse.Namespace:
-    return argparse.Namespace(**({"sets": "validation", "count": 2, "json": True} | changes))
+    given = {"sets": "validation", "count": 2, "fields": "half", "threshold": 0.5, "json": True}
+    return argparse.Namespace(**(given | changes))
 
 
-def test_own_and_foreign_contexts_are_asked_in_turn(capsys) -> None:
-    assert run(_arguments(), Asked(0.9, 0.2, 0.4, 0.6)) == 0
+def test_own_foreign_and_disturbed_objects_are_asked_in_turn(capsys) -> None:
+    answers = (0.9, 0.2, 0.6, 0.4, 0.7, 0.1)
+    assert run(_arguments(), Given(*answers)) == 0
     (found,) = json.loads(capsys.readouterr().out)
-    assert found["own"] == [0.9, 0.4] and found["foreign"] == [0.2, 0.6]
     assert found["area"] == pytest.approx(0.75)
-    assert run(_arguments(json=False), Asked(0.9, 0.2, 0.4, 0.6)) == 0
-    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert ["0.5", "50.0", "50.0", "0.0", "100.0", "nan"] in rows
+    rows = [FamiliarityRow(**row) for row in found["questions"]]
+    kinds = ["own", "both", "half", "own", "grasped", "half"]
+    assert [row.kind for row in rows] == kinds
+    assert [row.familiarity for row in rows] == pytest.approx(answers)
+    assert not any(row.right for row in rows)  # the identity is no answer
+    assert run(_arguments(json=False), Given(*answers)) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["own", "2", "50.0", "0.0", "50.0"] in lines and ["both", "1", "100.0"] in lines
+
+
+def test_shares_by_hand() -> None:
+    rows = [
+        FamiliarityRow(0, "own", 0.9, True),
+        FamiliarityRow(1, "own", 0.8, False),
+        FamiliarityRow(2, "own", 0.3, True),
+        FamiliarityRow(3, "own", 0.5, True),
+        FamiliarityRow(0, "swapped", 0.4, False),
+    ]
+    assert refused(rows, "own", 0.5) == 0.25 and refused(rows, "swapped", 0.5) == 1
+    assert right_or_refused(rows, "own", 0.5) == 0.75
+    assert np.isnan(refused(rows, "half", 0.5)) and np.isnan(right_or_refused(rows, "half", 0.5))
+    assert "75.0 % of the comparisons" in familiarity_table("set", rows, 0.5)
 
 
 def test_the_area_is_the_statistic_of_mann_and_whitney() -> None:
     rng = np.random.default_rng(0)
     own, foreign = rng.random(40).round(1) * 0.7 + 0.3, rng.random(30).round(1)
-    ours = Familiarity("set", tuple(own), tuple(foreign)).area()
-    assert ours == pytest.approx(mannwhitneyu(own, foreign).statistic / (40 * 30))
+    rows = [FamiliarityRow(k, "own", v, True) for k, v in enumerate(own)]
+    rows += [FamiliarityRow(k, "target", v, False) for k, v in enumerate(foreign)]
+    assert area(rows) == pytest.approx(mannwhitneyu(own, foreign).statistic / (40 * 30))
 
 
-def test_an_aligner_that_cannot_tell_is_refused() -> None:
-    with pytest.raises(IgaDrakeError, match="asked: gives no familiarity"):
-        run(_arguments(), Asked(None))
-    with pytest.raises(IgaDrakeError, match="--count 0"):
-        run(_arguments(count=0), Asked())
-    with pytest.raises(IgaDrakeError, match="'nowhere' is not known"):
-        run(_arguments(sets="nowhere"), Asked())
+def test_what_cannot_be_asked_is_refused() -> None:
+    for changes, message in (
+        ({}, "given: gives no familiarity"),
+        ({"count": 0}, "--count 0"),
+        ({"sets": "nowhere"}, "'nowhere' is not known"),
+        ({"fields": "rain"}, "--fields: 'rain' is not known; one of: stray"),
+        ({"threshold": 2.0}, "--threshold 2: expected 0 to 1"),
+    ):
+        with pytest.raises(IgaDrakeError, match=message):
+            run(_arguments(**changes), Given(None))

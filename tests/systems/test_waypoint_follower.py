@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from control_fixtures import downward, panda_robot, panda_solver
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
@@ -255,7 +255,6 @@ def test_the_slowest_motion_does_not_jump(scale: float):
 
 
 @given(st.floats(-4, 0), st.floats(-3, 1), st.floats(0.001, 0.5))
-@settings(max_examples=15)
 def test_a_motion_keeps_its_speed_and_arrives(scale: float, ramp: float, distance: float):
     speed = 0.25 * 10**scale
     run = Run(linear_speed=2.0, ramp=10**ramp)

@@ -43,7 +43,7 @@ class Rest:
             CoulombFriction(0.6, 0.6),
         )
         for item in scene.objects:
-            (instance,) = Parser(self.plant).AddModelsFromString(item.sdf, "sdf")
+            (instance,) = Parser(self.plant).AddModelsFromString(item.model, "sdf")
             body = self.plant.GetBodyByName(item.name, instance)
             self.plant.SetDefaultFloatingBaseBodyPose(body, item.X_WO)
         self.plant.Finalize()

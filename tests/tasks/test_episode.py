@@ -130,7 +130,7 @@ def test_demonstrations_of_another_task_are_refused_before_anything_is_built(
 
 def test_unknown_aligners_and_options_are_refused(scenario: Scenario):
     with pytest.raises(AlignerError, match=r"one of: .*icp, iga"):
-        Episode(scenario, aligner="oracle")
+        Episode(scenario, aligner="orakel")
 
 
 def test_no_demonstrations_are_refused(scenario: Scenario):

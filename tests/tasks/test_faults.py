@@ -191,8 +191,10 @@ ALIGNER_FAULTS: dict[str, tuple[Callable[[PoseEstimate], Any], Cause, str]] = {
     "transposed": (lambda good: SimpleNamespace(
         **{**vars(good), "poses": good.poses.transpose(0, 2, 1)}
     ), Cause.ALIGNMENT, "not rigid"),
-    "familiarity NaN": (_changed(familiarity=np.nan), Cause.ALIGNMENT, "familiarity: nan"),
-    "familiarity 7": (_changed(familiarity=7), Cause.ALIGNMENT, "familiarity: 7"),
+    "familiarity NaN": (
+        _changed(familiarity=[0, np.nan]), Cause.ALIGNMENT, r"familiarity: \[0, nan\]"
+    ),
+    "familiarity 7": (_changed(familiarity=[7, 0.5]), Cause.ALIGNMENT, r"familiarity: \[7, 0.5\]"),
     "familiarity words": (_changed(familiarity="high"), Cause.ALIGNMENT, "familiarity: str found"),
     "too slow": (_slow, Cause.TIME, "no answer after 1.1 s, the limit is 1 s"),
     "too far": (_changed(poses=_at(9, 0, 0)), Cause.IK, "before grasp lies outside the workspace"),

@@ -56,6 +56,11 @@ def test_a_cap_left_on_the_stand_for_two_seconds_is_a_success(scene: Scene) -> N
     verdict = Hang().success(scene, _trajectory(scene))
     assert verdict.success and verdict.reason == ""
     assert verdict.measures["carrying_slip"] == pytest.approx(0.0, abs=1e-9)
+    # It may swing: 16 mm to and fro.
+    swings = _trajectory(
+        scene, X_WO=lambda t: RigidTransform([0.008 * np.sin(2 * np.pi * t), 0, 0])
+    )
+    assert Hang().success(scene, swings).success
     # It may rock: out of touch at the very end.
     rocks = _trajectory(scene, contacts=lambda t: STANDS if t > 3.3 else HANGS)
     assert Hang().success(scene, rocks).success
@@ -69,7 +74,9 @@ def test_a_cap_left_on_the_stand_for_two_seconds_is_a_success(scene: Scene) -> N
         ({"contacts": lambda t: HANGS | {frozenset((HELD, TABLE))}}, "touches the table"),
         ({"contacts": lambda t: STANDS}, "doesn't hang"),
         ({"target_roll": 0.3}, "stand is tilted"),
-        ({"X_WO": lambda t: RigidTransform([0.03 * t, 0, 0])}, "still moves"),
+        ({"X_WO": lambda t: RigidTransform([0.06 * t, 0, 0])}, "still moves"),
+        ({"X_WO": lambda t: RigidTransform([0, 0, -0.13])}, "not at the hook"),
+        ({"X_WO": lambda t: RigidTransform([0, 0.2 * (t < 2), 0])}, "not at the hook"),
         ({"X_EO": lambda t: RigidTransform([0, 1.2 * SLIP * min(t / 0.9, 1.0), 0])}, "slipped"),
     ],
 )

@@ -194,7 +194,7 @@ def test_slip_is_in_the_hand_whatever_the_hand_does() -> None:
         HeldStill(object="box", slip=0.01)
 
 
-def test_carrying_ends_where_something_else_is_touched() -> None:
+def test_carrying_is_the_time_in_the_hand_alone() -> None:
     def slipping(first_touch: float, what: tuple[str, str] = ("box", "marble")) -> list[Snapshot]:
         hand = ("box", ROBOT)
         return _snapshots(
@@ -210,6 +210,16 @@ def test_carrying_ends_where_something_else_is_touched() -> None:
     # What the marble touches is not the box' business; the table is.
     assert not _holds(still, slipping(1.0, ("marble", TABLE)))
     assert _holds(still, slipping(1.0, ("box", TABLE)))
+    # What was taken from the table at 1 s and meets the marble at 2 s was carried in between.
+    others = [TABLE, ROBOT, "marble"]
+    taken = _snapshots(
+        contacts=lambda t: {("box", others[min(int(t), 2)])},
+        box=lambda t: _pose([0, 0, 0.01 * t]) @ START["box"],
+    )
+    assert _judged(still, taken, "carrying_slip") == pytest.approx(0.0095)
+    # What was never carried did not slip.
+    lying = _snapshots(contacts=lambda t: {("box", TABLE)})
+    assert _judged(still, lying, "carrying_slip") == 0.0
     with pytest.raises(TaskError, match="for_last"):
         CarriedStill(object="box", slip=0.01, for_last=1.0)
     with pytest.raises(TaskError, match="no snapshots"):

@@ -14,6 +14,8 @@ CASES = {
     "stack": ((3, 4, 5, 6), 3),
     "hang": ((3,), 1),
     "insert": ((3,), 1),
+    "pick_and_stack": ((3,), 1),
+    "pick_and_insert": ((3,), 1),
 }
 
 

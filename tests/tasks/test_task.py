@@ -57,7 +57,7 @@ def test_scenes_rest_on_the_table_without_penetration(
 
 def test_scenes_are_a_function_of_their_seed(task: Task, tmp_path: Path) -> None:
     one, same, other = (task.scene(seed, mesh_folder=tmp_path) for seed in (3, 3, 4))
-    assert one.objects[0].sdf == same.objects[0].sdf
+    assert one.objects[0].model == same.objects[0].model
     np.testing.assert_array_equal(
         one.objects[0].X_WO.GetAsMatrix4(), same.objects[0].X_WO.GetAsMatrix4()
     )

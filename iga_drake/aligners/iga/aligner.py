@@ -22,17 +22,25 @@ from torch import Tensor
 
 from iga_drake.aligners.iga.descriptor import Description, DescriptorNet
 from iga_drake.aligners.iga.energy import PairEnergyNet, SearchConfig, minimise, pair_proposals
+from iga_drake.aligners.iga.familiarity import (
+    FamiliarityNet,
+    ObjectNodes,
+    among_demonstrations,
+    familiarity_figures,
+)
 from iga_drake.aligners.iga.node_clouds import NodeClouds, beside_clutter, drawn_points
 from iga_drake.aligners.iga.voting import Match, VotingConfig, cast_votes, match_objects, modes
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate, check_question
-from iga_drake.checkpoint import file_digest, network_digest
+from iga_drake.checkpoint import CheckpointError, file_digest, network_digest
 from iga_drake.demonstrations.alignment import Alignment, check_direction
+from iga_drake.errors import shortened
 from iga_drake.geometry.se3 import inverse
 from iga_drake.paths import models_dir
 
 LANDED = "landed"
 MINIMUM = 16  # distinct points that a cloud keeps
-INFERENCE_STAGES = ("prepare", "describe", "match", "vote", "energy")  # the first: demonstrations
+# The first one: demonstrations.
+INFERENCE_STAGES = ("prepare", "describe", "match", "vote", "energy", "familiarity")
 TYPICAL_RADIUS = 0.065  # m, root-mean-square, of the objects that `VotingConfig`'s lengths are for
 UPS = ("grasped_up", "target_up")
 Memory = tuple[tuple[Tensor, Tensor], ...]
@@ -78,6 +86,7 @@ class Explanation:
     energy: Callable[[Tensor], Tensor]  # of any poses X_WF (..., 4, 4); differentiable
     # From a pose X_WF (4, 4): (P, Q) shares of the pairs of parts, the first nodes of each.
     pair_weights: Callable[[Tensor], Tensor]
+    familiarity_figures: Tensor  # (2, FIGURES) of the grasped and of the target object
     seconds: dict[str, float]  # of each stage
 
     @cached_property
@@ -96,6 +105,12 @@ class _Described:
     weight: Tensor  # (B, M) probability that a node belongs to the object
     memory: Memory  # what the network needs to describe further clouds of the same objects
 
+    def object_nodes(self, clouds: slice, M: int | None) -> ObjectNodes:
+        """The first M nodes of some of the clouds; None: all."""
+        return ObjectNodes(
+            self.descriptors[clouds, :M], self.clouds.at_nodes[clouds, :M], self.weight[clouds, :M]
+        )
+
     @property
     def size(self) -> float:
         """m, geometric mean of both objects' root-mean-square radii."""
@@ -113,6 +128,11 @@ def default_weights() -> Path:
     return models_dir() / "weights" / "descriptor.safetensors"
 
 
+def default_familiarity() -> Path:
+    """The landed checkpoint of the familiarity."""
+    return models_dir() / "weights" / "familiarity.safetensors"
+
+
 def default_energy() -> Path:
     """The landed checkpoint of the energy."""
     return models_dir() / "weights" / "energy.safetensors"
@@ -121,8 +141,8 @@ def default_energy() -> Path:
 class IgaAligner:
     """`Aligner` by dense SE(3)-invariant correspondence and consistency voting.
 
-    The learned factorised energy tells how familiar the objects look. It can also refine and rank
-    what the vote proposes (`IgaConfig.ranking`, `iga-energy`).
+    The learned factorised energy can refine and rank what the vote proposes (`IgaConfig.ranking`,
+    `iga-energy`).
     """
 
     def __init__(
@@ -131,25 +151,48 @@ class IgaAligner:
         *,
         weights: Path | str | None = None,
         energy: PairEnergyNet | Path | str | None = LANDED,
+        familiarity: FamiliarityNet | Path | str | None = LANDED,
         config: IgaConfig | None = None,
         voting: VotingConfig | None = None,
         search: SearchConfig | None = None,
     ):
-        """Takes a network, or reads `weights` (default: the landed checkpoint); likewise `energy`
-        (None: voting alone, and no familiarity).
+        """Takes a network, or reads `weights` (default: the landed checkpoint).
+
+        Args:
+          energy: network or checkpoint; read and used with the ranking "energy" alone.
+          familiarity: network or checkpoint, fitted to these descriptors; None: estimates have no
+            familiarity. Default: the landed one with the landed descriptors, none with others.
 
         The networks themselves are left as they are. Raises `CheckpointError` (`checkpoint`) for a
-        missing or foreign file.
+        missing or foreign file, or a familiarity fitted to other descriptors.
         """
-        from iga_drake.aligners.iga.weights import load_descriptor, load_energy
+        from iga_drake.aligners.iga.weights import load_descriptor, load_energy, load_familiarity
 
-        digests = []
+        self.config = config or IgaConfig()
+        if self.config.ranking not in RANKINGS:
+            raise AlignerError(
+                f"iga: ranking '{self.config.ranking}', must be one of: {', '.join(RANKINGS)}"
+            )
+        if familiarity == LANDED:
+            familiarity = default_familiarity() if net is None and weights is None else None
         if net is None:
             path = Path(weights) if weights else default_weights()
             net, _ = load_descriptor(path)
-            digests.append(file_digest(path))
+            digests = [file_digest(path)]
         else:
-            digests.append(network_digest(net))
+            digests = [network_digest(net)]
+        if isinstance(familiarity, (str, Path)):
+            path = Path(familiarity)
+            familiarity, card = load_familiarity(path)
+            if card.get("descriptor") != digests[0]:
+                raise CheckpointError(
+                    f"{path}: fitted to the descriptors {shortened(card.get('descriptor'))}, in "
+                    f"use are {digests[0]}: fit it again with `iga train familiarity`"
+                )
+        if self.config.ranking == "vote":
+            energy = None
+        elif energy is None:
+            raise AlignerError("iga: ranking 'energy' needs an energy: name its weights")
         if isinstance(energy, (str, Path)):
             path = default_energy() if energy == LANDED else Path(energy)
             energy, _ = load_energy(path)
@@ -158,14 +201,10 @@ class IgaAligner:
             digests.append(network_digest(energy))
         self.weights_digest = "+".join(digests)
         self._energy = copy.deepcopy(energy).eval().double() if energy is not None else None
+        self._familiarity = (
+            copy.deepcopy(familiarity).eval().double() if familiarity is not None else None
+        )
         self._net = copy.deepcopy(net).eval().float()
-        self.config = config or IgaConfig()
-        if self.config.ranking not in RANKINGS:
-            raise AlignerError(
-                f"iga: ranking '{self.config.ranking}', must be one of: {', '.join(RANKINGS)}"
-            )
-        if self.config.ranking == "energy" and energy is None:
-            raise AlignerError("iga: ranking 'energy' needs an energy: name its weights")
         self.name = "iga" if self.config.ranking == "vote" else "iga-energy"
         self.voting = voting or VotingConfig()
         self.search = search or SearchConfig()
@@ -266,17 +305,19 @@ class IgaAligner:
         stage()
         energy: Callable[[Tensor], Tensor] = votes.energy
         pair_weights: Callable[[Tensor], Tensor] = votes.pair_weights
-        familiarity = None
         if self._energy is not None:
             prepared = self._energy(
                 pair_proposals(
                     A, B, nodes_A, nodes_B, self._energy.config, self.voting, trimmed=True
                 )
             )
-            if self.config.ranking == "energy":
-                X, energies = minimise(prepared, also=voted, config=self.search)
-                energy, pair_weights = prepared, prepared.pair_weights
-            familiarity = float(self._energy.familiarity(prepared, X[0]))
+            X, energies = minimise(prepared, also=voted, config=self.search)
+            energy, pair_weights = prepared, prepared.pair_weights
+        stage()
+        figures = self._familiarity_figures(test, shown, M)
+        familiarity = None
+        if self._familiarity is not None:
+            familiarity = self._familiarity(figures).numpy()
         stage()
         probability = (-(energies - energies.min())).softmax(0).numpy()
         keep = probability >= self.config.minimum_probability * probability.max()
@@ -318,8 +359,34 @@ class IgaAligner:
             proposals=votes.proposals,
             energy=lambda X: energy(in_own_frames(X)),
             pair_weights=lambda X: pair_weights(in_own_frames(X)),
+            familiarity_figures=figures,
             seconds=dict(zip(INFERENCE_STAGES, np.diff(times).tolist(), strict=True)),
         )
+
+    def _familiarity_figures(self, test: "_Described", shown: "_Described", M: int) -> Tensor:
+        """(2, FIGURES) of the grasped and of the target object, by the first M nodes."""
+        net = self._familiarity or FamiliarityNet()
+        temperature = float(self._net.temperature)
+        D = len(shown.descriptors) // 2
+        return torch.stack(
+            [
+                familiarity_figures(
+                    test.object_nodes(slice(role, role + 1), M),
+                    shown.object_nodes(slice(role * D, (role + 1) * D), M),
+                    temperature,
+                    net.typical,
+                )
+                for role in range(2)
+            ]
+        )
+
+    def among_demonstrations(self, context: tuple[Alignment, ...]) -> Tensor:
+        """(2, MATCHES) of the grasped and of the target object, NaN of a single demonstration: how
+        well the demonstrations' nodes match each other."""
+        shown, D = self._shown(context, _known_ups(context)), len(context)
+        nodes = [shown.object_nodes(slice(role * D, (role + 1) * D), None) for role in range(2)]
+        temperature = float(self._net.temperature)
+        return torch.stack([among_demonstrations(each, temperature) for each in nodes])
 
     def prepare(self, context: tuple[Alignment, ...]) -> None:
         """Computes and keeps what depends on the demonstrations alone, so that `align` finds it;

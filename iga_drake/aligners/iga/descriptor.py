@@ -281,4 +281,9 @@ class DescriptorNet(nn.Module):
 
     def similarity(self, a: Tensor, b: Tensor) -> Tensor:
         """Logits (..., M, N) of a match between descriptors (..., M, D) and (..., N, D)."""
-        return self.log_temperature.clamp(max=4.6).exp() * (a @ b.transpose(-1, -2))
+        return self.temperature * (a @ b.transpose(-1, -2))
+
+    @property
+    def temperature(self) -> Tensor:
+        """() factor that turns cosines of descriptors into logits."""
+        return self.log_temperature.clamp(max=4.6).exp()

@@ -44,7 +44,6 @@ class EnergyConfig:
     sigma_translation: float = 0.015  # m
 
 
-FAMILIAR = 12  # figures of a solved problem
 FEATURES = 13  # of a pair, a demonstration and a combination
 SPREAD = 6  # of a pair, over the demonstrations
 
@@ -288,31 +287,6 @@ class Energy:
         share = self.shares(X[None])[0]
         return torch.zeros(P * Q).to(share).index_add(0, i * Q + j, share).reshape(P, Q)
 
-    def familiarity_features(self, X: Tensor) -> Tensor:
-        """(FAMILIAR,) of the problem with its best pose X (4, 4): how well the objects match, how
-        well the demonstrations agree, how low the energy is; invariants."""
-        p = self.proposals
-        terms = self._terms(X[None, :3, :3], X[None, :3, 3])
-        share = self._pairs(terms)[0].softmax(-1)  # (K,)
-        likely = terms[0].logsumexp(-1)  # (K, D)
-        behind = share @ torch.sigmoid(likely - self.log_outlier[:, None])  # (D,)
-        best = terms[0].argmax(-1)[..., None, None]
-        chosen = torch.gather(p.features, 2, best.expand(-1, -1, 1, FEATURES))[:, :, 0]
-        of_demonstration = torch.einsum("k,kdf->df", share, chosen.clamp(-12, 12))
-        matched = p.features[0, :, :, 2:4].masked_fill(~p.there[..., None], -math.inf).amax(1)
-        D = len(matched)
-        value = -self.temperature * self._pairs(terms).logsumexp(-1)[0]
-        return torch.stack(
-            (
-                *matched.mean(0),  # log-likelihood of the best hypotheses of A and of B
-                *matched.amin(0),
-                *of_demonstration[:, 4:9].mean(0),  # gap, residuals and certainty of the parts
-                behind.mean(),
-                value / D,
-                torch.tensor(math.log(D)).to(value),
-            )
-        )
-
     def refine(self, X: Tensor, steps: int = 4) -> Tensor:
         """Poses (n, 4, 4) moved down the energy: each step takes the mean of the proposals,
         weighted by their part in the pose's likelihood (expectation maximisation, or mean shift:
@@ -354,18 +328,9 @@ class PairEnergyNet(nn.Module):
         self.of_combination = nn.Linear(h, 3)
         self.of_pair = nn.Sequential(nn.Linear(h + inputs, h), nn.GELU(), nn.Linear(h, 2))
         self.log_temperature = nn.Parameter(torch.zeros(()))
-        # Logistic regression, fitted when all else is trained: see `familiarity`.
-        self.familiar_weight = nn.Parameter(torch.zeros(FAMILIAR), requires_grad=False)
-        self.familiar_bias = nn.Parameter(torch.zeros(()), requires_grad=False)
         for layer in (self.of_combination, self.of_pair[-1]):
             nn.init.zeros_(layer.weight)  # type: ignore[arg-type]
             nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
-
-    def familiarity(self, energy: Energy, X: Tensor) -> Tensor:
-        """() probability that a problem's demonstrations show its objects, from its best pose X (4,
-        4); one half as long as nothing was fitted."""
-        figures = energy.familiarity_features(X)
-        return torch.sigmoid(figures @ self.familiar_weight + self.familiar_bias)
 
     def forward(self, proposals: PairProposals) -> Energy:
         """The energy of a problem."""

@@ -4,10 +4,12 @@ from pathlib import Path
 
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
 from iga_drake.aligners.iga.energy import EnergyConfig, PairEnergyNet
+from iga_drake.aligners.iga.familiarity import FamiliarityNet
 from iga_drake.checkpoint import load_network, sizes_in_card
 
 DESCRIPTOR = "descriptor"
 ENERGY = "energy"
+FAMILIARITY = "familiarity"
 
 
 def descriptor_config(card: dict) -> DescriptorConfig:
@@ -38,4 +40,14 @@ def load_energy(path: Path) -> tuple[PairEnergyNet, dict]:
         kind=ENERGY,
         build=lambda card, _: PairEnergyNet(sizes_in_card(EnergyConfig, card["model"])),
         remedy="train one with `iga train energy` or name another",
+    )
+
+
+def load_familiarity(path: Path) -> tuple[FamiliarityNet, dict]:
+    """The fitted familiarity (evaluation mode) and its card; raises `CheckpointError`."""
+    return load_network(
+        path,
+        kind=FAMILIARITY,
+        build=lambda card, _: FamiliarityNet(),
+        remedy="fit one with `iga train familiarity` or name another",
     )

@@ -74,7 +74,9 @@ class CameraNoise(LeafSystem):
     ):
         """
         Args:
-          width, height, focal: of the images, in pixels.
+          width: of the images, in pixels.
+          height: of the images, in pixels.
+          focal: length, in pixels.
           frame_period: time (s) for which the noise of one image stays the same.
           seed: integers >= 0 that nothing else shares (episode, camera).
         """

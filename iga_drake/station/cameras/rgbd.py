@@ -25,7 +25,7 @@ from iga_drake.dataset.depth_noise import DepthNoise
 from iga_drake.errors import check_bounds, check_range
 from iga_drake.station.cameras.noise import CalibrationError, CameraNoise, calibration_error
 
-_RENDERER = "vtk"
+RENDERER = "vtk"
 _CLIPPING = (0.01, 10.0)  # m, of the renderer
 _FARTHEST = 20.0  # m, of a camera from the robot along each axis
 
@@ -135,7 +135,7 @@ class RgbdCamera:
         """See `CameraKind.add`. `pose` is the calibrated pose, off by the calibration error; each
         image is rendered only when its port is evaluated, so `time` is now."""
         core = RenderCameraCore(
-            _RENDERER, rendering_info(self.intrinsics), ClippingRange(*_CLIPPING), RigidTransform()
+            RENDERER, rendering_info(self.intrinsics), ClippingRange(*_CLIPPING), RigidTransform()
         )
         X_WC = true_pose(self)
         sensor = builder.AddNamedSystem(
@@ -223,7 +223,7 @@ def add_renderer(scene_graph: SceneGraph) -> None:
         ],
         backend="EGL",
     )
-    scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(params))
+    scene_graph.AddRenderer(RENDERER, MakeRenderEngineVtk(params))
 
 
 CAMERAS = {"rgbd": RgbdCamera}

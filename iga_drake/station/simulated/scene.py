@@ -14,16 +14,19 @@ ObjectRole = Literal["target", "grasped", "other"]
 
 @dataclass(frozen=True)
 class SceneObject:
-    """A free body on the table or in the hand."""
+    """A thing on the table or in the hand: bodies that move together, or are fixed to the world."""
 
     # Name of the model instance in the plant.
     name: str
     # Cloud that its pixels belong to; "other" objects are labelled as background.
     role: ObjectRole
-    # SDF text of one model with one link; mesh URIs in it are absolute file URIs.
-    sdf: str
-    # Initial pose in the world (= robot base) frame.
+    # Text of one SDF or URDF model, or Drake's model directives; URIs in it are absolute file URIs.
+    model: str
+    # Initial pose in the world (= robot base) frame of the base body: the one that is free, or, of
+    # what is fixed to the world, the first.
     X_WO: RigidTransform
+    # File that the text is from, for messages.
+    source: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,13 +1,12 @@
 """The simulation station: robot, table, objects and cameras behind the one port contract."""
 
+from collections.abc import Mapping
 from typing import cast
 
 import numpy as np
 from pydrake.geometry import Box, Meshcat, SceneGraph
 from pydrake.math import RigidTransform
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant
-from pydrake.multibody.tree import RigidBody
 from pydrake.symbolic import Expression, Variable
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort
 from pydrake.systems.lcm import LcmBuses
@@ -20,7 +19,13 @@ from iga_drake.station.contract import CHEAT, StationError
 from iga_drake.station.panda.driver import add_panda_ports
 from iga_drake.station.panda.model import PandaModel, Visuals, add_panda
 from iga_drake.station.scenario import Scenario, Table
-from iga_drake.station.simulated.scene import Scene, SceneObject
+from iga_drake.station.simulated.model_files import (
+    AddedObject,
+    add_object,
+    check_object,
+    names_the_world,
+)
+from iga_drake.station.simulated.scene import Scene
 from iga_drake.systems.ports import PANDA_JOINTS, ArmMode, Role
 from iga_drake.systems.segmentation import Segmentation
 from iga_drake.viewing.meshcat import add_visualizers
@@ -34,8 +39,9 @@ def build_simulation_station(
     It exports `station_ports(scenario.camera_names)` and besides, under `cheat.`:
     `cheat.body_poses` (list of X_WB by body index), `cheat.state` (plant state),
     `cheat.contact_results` and `cheat.query_object`. Its default context is the scene: joint
-    angles, hand opening, object poses. Objects are free bodies, held by contact alone. The plant is
-    `station.GetSubsystemByName("plant")`; objects are its model instances by their names.
+    angles, hand opening, object poses. Objects are held by contact alone, unless their model is
+    fixed to the world. The plant is `station.GetSubsystemByName("plant")`; objects are its model
+    instances by their names.
 
     Args:
       seed: >= 0; draws camera noise, clutter and calibration errors, with `scenario.seeds.cameras`
@@ -50,14 +56,26 @@ def build_simulation_station(
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(config=scenario.plant, builder=builder)
     plant.set_name("plant")
+    for item in scene.objects:
+        if item.role not in _ROLES:
+            raise StationError(f"object '{item.name}': role '{item.role}', allowed: {[*_ROLES]}")
+    first = {id(item) for item in scene.objects if names_the_world(item)}
+    added = {item.name: add_object(plant, item) for item in scene.objects if id(item) in first}
     panda = add_panda(plant, controlled=True, visuals=cast(Visuals, scenario.panda.visuals))
     _add_table(plant, scenario.table)
+    for item in scene.objects:
+        if id(item) not in first:
+            added[item.name] = add_object(plant, item)
     roles = {int(body): Role.ROBOT for body in plant.GetBodyIndices(panda.instance)}
     for item in scene.objects:
-        body = _add_object(plant, item)
-        roles[int(body.index())] = _ROLES[item.role]
+        for body in added[item.name].bodies:
+            roles[int(body.index())] = _ROLES[item.role]
     plant.Finalize()
-    _set_default_state(plant, panda, scene)
+    _set_default_state(plant, panda, scene, added)
+    start = plant.CreateDefaultContext()
+    for item in scene.objects:
+        source = f"object '{item.name}'" + (f" ({item.source})" if item.source else "")
+        check_object(plant, scene_graph.model_inspector(), start, added[item.name], source)
 
     _add_robot_ports(builder, panda, scenario)
     add_renderer(scene_graph)
@@ -112,25 +130,9 @@ def _add_table(plant: MultibodyPlant, table: Table) -> None:
     )
 
 
-def _add_object(plant: MultibodyPlant, item: SceneObject) -> RigidBody:
-    """Parses one free body from its SDF text."""
-    if item.role not in _ROLES:
-        raise StationError(f"object '{item.name}': role '{item.role}', allowed: {[*_ROLES]}")
-    parser = Parser(plant)
-    parser.SetAutoRenaming(True)
-    try:
-        (instance,) = parser.AddModelsFromString(item.sdf, "sdf")
-        plant.RenameModelInstance(instance, item.name)
-        (body,) = plant.GetBodyIndices(instance)
-    except (RuntimeError, ValueError) as e:
-        raise StationError(
-            f"object '{item.name}': its SDF must hold one model with one link and its name must be "
-            f"free: {e}"
-        ) from e
-    return plant.get_body(body)
-
-
-def _set_default_state(plant: MultibodyPlant, panda: PandaModel, scene: Scene) -> None:
+def _set_default_state(
+    plant: MultibodyPlant, panda: PandaModel, scene: Scene, added: Mapping[str, AddedObject]
+) -> None:
     """Makes the plant's default context the scene's initial situation."""
     q = np.asarray(scene.panda_position, dtype=float)
     if q.shape != (PANDA_JOINTS,) or not np.isfinite(q).all():
@@ -144,9 +146,8 @@ def _set_default_state(plant: MultibodyPlant, panda: PandaModel, scene: Scene) -
     for joint in panda.finger_joints:
         joint.set_default_positions([scene.hand_opening / 2])
     for item in scene.objects:
-        instance = plant.GetModelInstanceByName(item.name)
-        (body,) = plant.GetBodyIndices(instance)
-        plant.SetDefaultFloatingBaseBodyPose(plant.get_body(body), item.X_WO)
+        if not added[item.name].fixed:
+            plant.SetDefaultFloatingBaseBodyPose(added[item.name].base, item.X_WO)
 
 
 def _add_robot_ports(builder: DiagramBuilder, panda: PandaModel, scenario: Scenario) -> None:

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from iga_drake.aligners.iga.aligner import IgaAligner
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
 from iga_drake.aligners.iga.energy import PairEnergyNet
-from iga_drake.aligners.iga.weights import DESCRIPTOR, ENERGY, load_descriptor
+from iga_drake.aligners.iga.familiarity import FamiliarityNet
+from iga_drake.aligners.iga.weights import DESCRIPTOR, ENERGY, FAMILIARITY, load_descriptor
 from iga_drake.aligners.registry import make_aligner
 from iga_drake.checkpoint import CheckpointError, save_checkpoint
 
@@ -86,15 +87,23 @@ def test_any_card_is_refused_or_describes_the_network(change) -> None:
 
 def test_an_energy_of_nan_makes_no_aligner(tmp_path: Path) -> None:
     net = PairEnergyNet()
-    net.familiar_bias.data.fill_(math.nan)
+    net.log_temperature.data.fill_(math.nan)
     path = tmp_path / "energy.safetensors"
     card = {"model": dataclasses.asdict(net.config)}
     save_checkpoint(path, net.state_dict(), kind=ENERGY, card=card)
-    with pytest.raises(CheckpointError, match="'familiar_bias' holds numbers that are not finite"):
-        make_aligner("iga", energy=str(path))
+    with pytest.raises(CheckpointError, match="'log_temperature' holds numbers that are not"):
+        make_aligner("iga-energy", energy=str(path))
 
 
 def test_an_aligner_leaves_the_network_it_is_given_alone() -> None:
     net = DescriptorNet(CONFIG).train()
     IgaAligner(net)
     assert net.training and next(net.parameters()).dtype == torch.float32
+
+
+def test_a_familiarity_of_other_descriptors_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "familiarity.safetensors"
+    save_checkpoint(path, FamiliarityNet().state_dict(), kind=FAMILIARITY, card={"descriptor": "0"})
+    with pytest.raises(CheckpointError, match="fitted to the descriptors '0', in use are "):
+        make_aligner("iga", familiarity=str(path))
+    assert IgaAligner(DescriptorNet(CONFIG)).weights_digest  # own descriptors: none is asked for

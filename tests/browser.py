@@ -1,0 +1,140 @@
+"""Headless Chromium for tests of pages, driven by the DevTools protocol over a pipe."""
+
+import base64
+import json
+import os
+import select
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import pytest
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+# Where a browser has to be there, its lack is an error.
+needs_browser = pytest.mark.skipif(
+    CHROMIUM is None and not os.environ.get("IGA_NEEDS_BROWSER"),
+    reason="no chromium: apt-get install chromium",
+)
+
+
+class Browser:
+    """One page of headless Chromium, drawn in software; a context manager that ends it.
+
+    `errors` are the messages of level "error" and the exceptions of the page so far.
+    """
+
+    def __init__(self, profile: Path, *, width: int = 1280, height: int = 720) -> None:
+        """`profile`: a new folder for the browser's own files."""
+        assert CHROMIUM is not None, "chromium is missing: apt-get install chromium"
+        from_browser, to_us = os.pipe()
+        to_browser, from_us = os.pipe()
+        # The browser reads commands from descriptor 3 and writes answers to descriptor 4.
+        script = f'exec "$@" 3<&{to_browser} 4>&{to_us}'
+        self._process = subprocess.Popen(
+            [
+                "bash", "-c", script, "chromium", CHROMIUM, "--headless", "--no-sandbox",
+                "--remote-debugging-pipe", f"--user-data-dir={profile}", "--no-first-run",
+                "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars",
+                "--disable-dev-shm-usage", f"--window-size={width},{height}", "about:blank",
+            ],
+            pass_fds=[to_browser, to_us],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        os.close(to_browser)
+        os.close(to_us)
+        self._read, self._write = from_browser, from_us
+        self._buffer = b""
+        self._number = 0
+        self._session: str | None = None
+        self.errors: list[str] = []
+        targets = self.command("Target.getTargets")["targetInfos"]
+        page = next(target["targetId"] for target in targets if target["type"] == "page")
+        self._session = self.command("Target.attachToTarget", targetId=page, flatten=True)[
+            "sessionId"
+        ]
+        for domain in ("Page", "Runtime", "Log"):
+            self.command(f"{domain}.enable")
+        self.command(
+            "Emulation.setDeviceMetricsOverride",
+            width=width, height=height, deviceScaleFactor=1, mobile=False,
+        )  # fmt: skip
+
+    def __enter__(self) -> "Browser":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._process.kill()
+        self._process.wait()
+        os.close(self._read)
+        os.close(self._write)
+
+    def command(self, method: str, timeout: float = 120.0, **parameters: Any) -> dict[str, Any]:
+        """Sends a command and returns its result; events that come before it are noted."""
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": parameters}
+        if self._session is not None:
+            message["sessionId"] = self._session
+        os.write(self._write, json.dumps(message).encode() + b"\0")
+        end = time.monotonic() + timeout
+        while True:
+            answer = self._receive(end - time.monotonic())
+            if answer.get("id") == self._number:
+                assert "error" not in answer, f"{method}: {answer['error']}"
+                return answer["result"]
+
+    def _receive(self, timeout: float) -> dict[str, Any]:
+        while b"\0" not in self._buffer:
+            ready, _, _ = select.select([self._read], [], [], max(0.0, timeout))
+            assert ready, "the browser doesn't answer"
+            part = os.read(self._read, 1 << 20)
+            assert part, "the browser has ended"
+            self._buffer += part
+        text, _, self._buffer = self._buffer.partition(b"\0")
+        message = json.loads(text)
+        found, event = message.get("params", {}), message.get("method")
+        if event == "Runtime.exceptionThrown":
+            detail = found["exceptionDetails"]
+            self.errors.append(detail.get("exception", {}).get("description", detail["text"]))
+        elif event == "Runtime.consoleAPICalled" and found["type"] in ("error", "assert"):
+            self.errors.append(" ".join(str(a.get("value", a)) for a in found["args"]))
+        elif event == "Log.entryAdded" and found["entry"]["level"] == "error":
+            self.errors.append(f"{found['entry']['text']} {found['entry'].get('url', '')}")
+        return message
+
+    def open(self, url: str) -> None:
+        """Begins to load a page."""
+        self.command("Page.navigate", url=url)
+
+    def evaluate(self, script: str) -> Any:
+        """The value of a JavaScript expression."""
+        done = self.command("Runtime.evaluate", expression=script, returnByValue=True)
+        assert "exceptionDetails" not in done, done["exceptionDetails"]
+        return done["result"].get("value")
+
+    def wait_for(self, script: str, timeout: float = 60.0) -> None:
+        """Waits until an expression has a value that counts as true."""
+        end = time.monotonic() + timeout
+        while not self.evaluate(f"Boolean({script})"):
+            assert time.monotonic() < end, f"not within {timeout} s: {script}; {self.errors}"
+            time.sleep(0.05)
+
+    def press(self, code: str) -> None:
+        """Presses a key, named as in JavaScript: "Space", "KeyN"."""
+        self.command("Input.dispatchKeyEvent", type="keyDown", code=code)
+        self.command("Input.dispatchKeyEvent", type="keyUp", code=code)
+
+    def picture(self, path: Path, **options: Any) -> None:
+        """Writes what is seen as a picture; `options` of `Page.captureScreenshot`."""
+        data = self.command("Page.captureScreenshot", **options)["data"]
+        path.write_bytes(base64.b64decode(data))

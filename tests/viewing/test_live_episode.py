@@ -1,0 +1,62 @@
+"""One whole episode looked at in a browser, live and as a replay.
+
+With IGA_PICTURES=DIR the pictures of the documentation are written there.
+"""
+
+import os
+from pathlib import Path
+
+from browser import Browser, needs_browser
+
+from iga_drake import Episode, load_scenario
+from iga_drake.policy.motion import Phase
+from iga_drake.viewing.meshcat import start_meshcat
+from iga_drake.viewing.replay import begin_recording, end_recording, replay_html
+
+JPEG = {"format": "jpeg", "quality": 80}
+# Of a picture, s: the bowl is on its way.
+MOMENT = 3.2
+
+
+def is_drawn(path: list[str]) -> str:
+    """Script: whether something is drawn below a path of the scene's tree."""
+    return (
+        "(() => { let found = false;"
+        f" viewer.scene_tree.find({path}).object.traverse(o => {{ found = found || o.geometry; }});"
+        " return found; })()"
+    )
+
+
+@needs_browser
+def test_an_episode_is_looked_at_live_and_as_a_replay(tmp_path: Path):
+    pictures = Path(os.environ.get("IGA_PICTURES", tmp_path))
+    scenario = load_scenario("stack", overrides=["policy.infer_limit=600"])
+    meshcat = start_meshcat(scenario.visualization)
+    begin_recording(meshcat, live=True)
+    with Episode(scenario, seed=3, meshcat=meshcat) as episode:
+        status = episode.step(MOMENT)
+        assert status.phase is Phase.MOVE, status.reason
+        with Browser(tmp_path / "live", width=1280, height=720) as browser:
+            browser.open(meshcat.web_url())
+            browser.wait_for("typeof viewer == 'object' && viewer.scene_tree.children.drake", 120.0)
+            seen = max(observation.time for observation in episode.memory.observations.values())
+            image = ["drake", "cameras", "camera_0", f"image at {seen:.2f} s"]
+            text = ["Cameras", "default", "rotated", "<object>", "text"]
+            for path in (image, text, ["drake", "illustration", "panda", "panda_link7"]):
+                browser.wait_for(is_drawn(path), 120.0)
+            browser.picture(pictures / "live.jpg", **JPEG)
+            assert browser.errors == []
+        result = episode.run()
+        row = result.row()
+        end_recording(meshcat)
+    page = tmp_path / "stack.html"
+    page.write_text(replay_html(meshcat, row), encoding="utf-8")
+    assert result.success and page.stat().st_size <= 4e6
+    with Browser(tmp_path / "replay", width=1280, height=720) as browser:
+        browser.open(f"{page.as_uri()}#t={MOMENT}")
+        browser.wait_for("typeof iga == 'object' && iga.ready()", 120.0)
+        assert "SUCCESS" in browser.evaluate("document.body.innerText")
+        link = ["drake", "illustration", "panda", "panda_link7"]
+        browser.wait_for(is_drawn(link), 120.0)
+        browser.picture(pictures / "replay.jpg", **JPEG)
+        assert browser.errors == []
