@@ -43,6 +43,11 @@ def on_page_markdown(markdown: str, page: object, config: MkDocsConfig, files: F
     return _moved(markdown, Path(config.docs_dir), set())
 
 
+def on_page_content(html: str, page: object, config: MkDocsConfig, files: Files) -> str:
+    """Names the ports of systems in words instead of Drake's directive."""
+    return html.replace("<p>.. pydrake_system::</p>", "<p>Ports:</p>")
+
+
 def _parts() -> list[str]:
     """Packages and public modules of the root, by name."""
     found = [path.parent.name for path in PACKAGE.glob("*/__init__.py")]

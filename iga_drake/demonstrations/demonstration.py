@@ -253,6 +253,14 @@ class DemonstrationSet:
         """Median opening of the hand (m) commanded once the waypoint is reached."""
         return float(np.median([d.waypoints[waypoint].opening for d in self.demonstrations]))
 
+    def turns(self, waypoint: int) -> np.ndarray:
+        """Rotations R_EE' (D, 3, 3) of the hand from the waypoint before to this one, which isn't
+        the first, one a demonstration."""
+        R_WE = np.stack(
+            [[w.X_WE[:3, :3] for w in d.waypoints[waypoint - 1 :][:2]] for d in self.demonstrations]
+        )
+        return np.swapaxes(R_WE[:, 0], 1, 2) @ R_WE[:, 1]
+
     @cached_property
     def contexts(self) -> tuple[tuple[Alignment, ...], ...]:
         """The aligner's context for each waypoint: one alignment a demonstration."""

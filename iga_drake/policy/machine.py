@@ -37,6 +37,7 @@ from iga_drake.policy.motion import (
     check_observation,
     check_workspace,
     choose_reachable,
+    modes_in_turn,
     motion_steps,
     moved_steps,
 )
@@ -484,6 +485,7 @@ class PolicyMachine:
             solve=self._solve,
             workspace=self._workspace,
             limit=config.infer_limit - seconds,
+            modes=self._modes_in_turn(memory, estimate, index),
         )
         memory = replace(memory, chosen=(*memory.chosen, chosen))
         detail = (
@@ -491,6 +493,17 @@ class PolicyMachine:
             f"{seconds:.2f} s"
         )
         return self._continue(memory, inputs, now, detail)
+
+    def _modes_in_turn(
+        self, memory: PolicyMemory, estimate: PoseEstimate, index: int
+    ) -> list[int] | None:
+        """The order in which to try the modes of a waypoint that relates the same clouds as the one
+        before; None where it doesn't, or where nothing was demonstrated."""
+        pairs = [(w.grasped, w.target) for w in self.motion.waypoints]
+        if self._demonstrations is None or index == 0 or pairs[index] != pairs[index - 1]:
+            return None
+        before = memory.chosen[index - 1].X_WE
+        return modes_in_turn(estimate, before, self._demonstrations.turns(index))
 
     def _known_up(self, name: str, seen: Observation) -> np.ndarray | None:
         """The way up (3,) of what was observed; None unless all demonstrations know theirs."""

@@ -314,6 +314,23 @@ class ReachablePose:
     symmetry: int  # index into the symmetries
 
 
+def modes_in_turn(
+    estimate: PoseEstimate, X_WE_before: RigidTransform, turns: np.ndarray
+) -> list[int]:
+    """Indices of the modes in the order in which to try them after the hand was at `X_WE_before`.
+
+    By energy, but those come last that turn the hand from there otherwise than all of `turns`
+    (D, 3, 3), the rotations R_EE' of the demonstrations, by more than a right angle. The modes of a
+    symmetric object are as good as each other at each waypoint, but half a turn between two of them
+    was never shown: a bottle may be half inside its shoe there.
+    """
+    R_EE = X_WE_before.rotation().matrix().T @ estimate.poses[:, :3, :3]  # (M, 3, 3)
+    # The trace of a rotation by an angle is 1 + 2 cos(angle).
+    traces = np.einsum("dij,mij->md", turns, R_EE)
+    strange = traces.max(axis=1) < 1.0
+    return [int(mode) for mode in np.argsort(strange, kind="stable")]
+
+
 def choose_reachable(
     estimate: PoseEstimate,
     motion: WaypointMotion,
@@ -322,8 +339,10 @@ def choose_reachable(
     solve: Callable[[RigidTransform, np.ndarray], np.ndarray | None],
     workspace: Workspace | None = None,
     limit: float = math.inf,
+    modes: Sequence[int] | None = None,
 ) -> ReachablePose:
-    """The mode of lowest energy whose poses before, at and after the waypoint are all reachable.
+    """The first of `modes` (indices into the estimate; default: all, the lowest energy first) whose
+    poses before, at and after the waypoint are all reachable.
 
     Among the symmetries of that mode the one whose posture is closest to `near` (7,) (rad) is
     taken. `solve(X_WE, q_near)` returns joint angles or None; it isn't asked for poses outside the
@@ -349,7 +368,8 @@ def choose_reachable(
                 Cause.TIME,
             )
 
-    for mode, (matrix, energy) in enumerate(zip(estimate.poses, estimate.energies, strict=True)):
+    for mode in range(len(estimate.poses)) if modes is None else modes:
+        matrix, energy = estimate.poses[mode], estimate.energies[mode]
         found: list[tuple[float, ReachablePose]] = []
         for symmetry, X_EE in enumerate(motion.symmetries_E):
             check_time()

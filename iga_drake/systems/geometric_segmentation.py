@@ -37,6 +37,9 @@ _STRIDE = 4
 _LOW, _TABLE_PIXELS, _TABLE_SHARE = 0.1, 200, 0.3
 # An object whose lowest point is within this (m) of the part that is taken for the table stands.
 _STANDS = 0.015
+# Of what touches nothing, so does what is within this (m): cameras that look down don't see the
+# lower side of round objects.
+_STANDS_ROUND = 0.04
 # Pieces that touch nothing below them belong to the object that is nearest to them, within (m).
 _JOINED = 0.04
 # Fewer voxels than this in the reach of the pads are a remainder of the robot, not an object.
@@ -402,7 +405,7 @@ class GeometricSegmenter:
             return np.zeros(0, int)
         corners = np.stack([points[:, :2].min(axis=0), points[:, :2].max(axis=0)])
         first, last = ((corners - self._corner) / _CELL).astype(int)
-        cells = np.stack(np.mgrid[first[0] : last[0] + 1, first[1] : last[1] + 1]).reshape(2, -1)
+        cells = np.mgrid[first[0] : last[0] + 1, first[1] : last[1] + 1].reshape(2, -1)
         middles = self._corner[:, None] + (cells + 0.5) * _CELL
         inside = (planes[:, :2] @ middles + planes[:, 2:] <= 0).all(axis=0)
         cells = cells[:, inside & (heights[tuple(cells)] > self._config.thin_clearance)]
@@ -435,6 +438,8 @@ class GeometricSegmenter:
         # To which group each belongs, itself to begin with.
         owner = np.arange(len(sizes))
         _join(owner, centroids, group, known=stands | held, floating=~(stands | held | noise))
+        low = bottom < config.table_height + config.table_clearance + _STANDS_ROUND
+        stands |= low & ~(stands | held | noise) & (owner == np.arange(len(sizes)))
         whole = owner[group]
         roles = np.full(len(centroids), Role.BACKGROUND, np.int16)
         if np.count_nonzero(held[whole]) >= config.minimum_voxels:

@@ -85,17 +85,21 @@ class OracleInference:
         now = self._snapshot()
         shapes = self._scene.truth.shapes
         X_WO = dict(now.X_WO)
-        grasped, cloud_W = self._clouds
-        target = self._scene.with_role("target")[0].name
-        X_WO[target] = seen_pose(cloud_W, shapes[target], X_WO[target])
+        cloud_E, cloud_W = self._clouds
         motion = self._task.motion.waypoints[self._waypoint]
-        roles = {plan.name: plan.role for plan in self._task.motion.observations}
-        if roles[motion.grasped] == "grasped":
-            held = self._scene.with_role("grasped")[0].name
+        target, held = self._object(motion.target), self._object(motion.grasped)
+        if target is not None:
+            X_WO[target] = seen_pose(cloud_W, shapes[target], X_WO[target])
+        if held is not None:
             X_EO = now.X_WE.inverse() @ X_WO[held]
-            X_WO[held] = now.X_WE @ seen_pose(grasped, shapes[held], X_EO)
+            X_WO[held] = now.X_WE @ seen_pose(cloud_E, shapes[held], X_EO)
         X_WE = self._task.expert(self._scene, X_WO, now.X_WE)[self._waypoint].GetAsMatrix4()
         return InferenceAnswer(PoseEstimate(X_WE[None], np.zeros(1), np.ones(1)), 0.0)
+
+    def _object(self, observation: str) -> str | None:
+        """The scene's object that an observation shows; None for the gripper."""
+        (plan,) = (p for p in self._task.motion.observations if p.name == observation)
+        return None if plan.role == "gripper" else self._scene.with_role(plan.role)[0].name
 
     def cancel(self) -> None:
         """Does nothing: the oracle answers at once."""

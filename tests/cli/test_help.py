@@ -16,9 +16,6 @@ from iga_drake.errors import missing_extra
 from iga_drake.station.scenario import load_scenario
 from iga_drake.tasks.registry import make_task
 
-# Verbs whose subcommands are modules of their own.
-PARTS = {"benchmark", "drive", "evaluate", "view"}
-
 
 def parsers() -> list[CommandParser]:
     """The parser of every verb and of every part of one."""
@@ -37,9 +34,8 @@ def parsers() -> list[CommandParser]:
         parser = CommandParser(prog=f"iga {verb}")
         module.add_arguments(parser)
         add(parser)
-        if verb in PARTS:
-            for what, chosen in module.SUBCOMMANDS.items():
-                add(subcommand_parser(verb, what, chosen))
+        for what, chosen in getattr(module, "SUBCOMMANDS", {}).items():  # modules of their own
+            add(subcommand_parser(verb, what, chosen))
     return found
 
 

@@ -113,29 +113,6 @@ def test_processes_make_the_same_bytes(local: Path, tmp_path: Path) -> None:
     assert contents(tmp_path / "two") == contents(local)
 
 
-def test_a_ray_cluster_makes_the_same_bytes(local: Path, tmp_path: Path, monkeypatch) -> None:
-    """Two nodes of one core; every node makes shards."""
-    import ray
-    from ray.cluster_utils import Cluster
-
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    node = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}
-    cluster = Cluster(initialize_head=True, head_node_args=node)
-    try:
-        cluster.add_node(num_cpus=1, object_store_memory=80 * 2**20)
-        cluster.wait_for_nodes()
-        ray.init(address=cluster.address, log_to_driver=False)
-        assert sum(node["Alive"] for node in ray.nodes()) == 2
-        done = export_shards(
-            "train", 5, tmp_path / "ray", config=SMALL, shard_size=2, jobs=-1, backend="ray"
-        )
-        assert done.made == 3
-        assert contents(tmp_path / "ray") == contents(local)
-    finally:
-        ray.shutdown()
-        cluster.shutdown()
-
-
 def test_bad_input_is_refused(local: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for arguments, message in [

@@ -126,3 +126,12 @@ def test_sets_of_mixed_waypoints_cannot_be_made():
     other = make_demonstration(waypoints=make_waypoints(names=("a", "b")))
     with pytest.raises(DemonstrationError, match="different waypoints"):
         DemonstrationSet(task="grasp", demonstrations=(make_demonstration(), other))
+
+
+def test_turns_lead_from_the_rotation_before():
+    shown = make_set(3)
+    turns = shown.turns(1)
+    assert turns.shape == (3, 3, 3)
+    for turn, demonstration in zip(turns, shown.demonstrations, strict=True):
+        before, at = (w.X_WE[:3, :3] for w in demonstration.waypoints)
+        np.testing.assert_allclose(before @ turn, at, atol=1e-12)

@@ -13,7 +13,6 @@ from iga_drake.evaluation.task_success import (
     TrialResult,
     evaluate,
     format_table,
-    on_cluster,
     run_trial,
     summarise_trials,
     trial_key,
@@ -143,26 +142,6 @@ def test_summary_counts_and_names_causes():
     table = format_table(results)
     assert "4 / 6" in table
     assert "grasp icp seed 1: contact: slipped" in table
-
-
-def test_a_cluster_gives_the_same_rows(monkeypatch):
-    """An episode that ends for lack of time, on a cluster of one core and here."""
-    import ray
-
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    monkeypatch.setenv("RAY_raylet_start_wait_time_s", "180")  # on a busy machine
-    arguments = ("grasp", "--set=task.time_limit=0.1", "--set=plant.time_step=0.01")
-    trials = make_trials([3, 4], arguments=arguments, aligner="expert")
-    ray.init(num_cpus=1, include_dashboard=False, object_store_memory=80 * 2**20)
-    try:
-        run, width = on_cluster(None)
-        there = evaluate(trials, processes=width, run=run)
-    finally:
-        ray.shutdown()
-    assert width == 1 and [result.cause for result in there] == ["time", "time"]
-    here = evaluate(trials, processes=2)
-    measured = {"wall_seconds": None, "real_time_factor": None}
-    assert [replace(r, **measured) for r in there] == [replace(r, **measured) for r in here]
 
 
 def test_a_process_that_breaks_is_a_failed_trial(tmp_path: Path):

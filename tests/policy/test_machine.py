@@ -16,11 +16,13 @@ from policy_fakes import (
     X_PRESENT,
     FakeAligner,
     FakeInputs,
+    make_demonstrations,
     make_machine,
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate
+from iga_drake.demonstrations.demonstration import DemonstrationSet
 from iga_drake.policy.inference import LocalInference
 from iga_drake.policy.machine import PolicyMachine
 from iga_drake.policy.motion import Phase, PolicyError, TaskMotion
@@ -331,6 +333,38 @@ def test_the_symmetry_near_the_present_posture_is_taken():
     motion = replace(GRASP, waypoints=(grip,))
     memory, _ = run(make_machine(motion, aligner, solve), FakeInputs())
     assert memory.chosen[0].symmetry == 1
+
+
+@pytest.mark.parametrize("turned", [0.0, np.pi])
+def test_the_hand_turns_between_waypoints_as_it_was_shown_to(turned: float):
+    """Of modes half a turn apart the one that follows the waypoint before as in a demonstration."""
+    flip = RigidTransform(RotationMatrix.MakeZRotation(np.pi), np.zeros(3))
+    modes = {"first": (X_GOAL,), "second": (X_GOAL @ flip, X_GOAL)}
+
+    class Both(FakeAligner):
+        def align(self, *arguments, **options):
+            self.poses = modes["second" if self.calls else "first"]
+            return super().align(*arguments, **options)
+
+    still = replace(PUT, before_W=(0.0, 0.0, 0.0), opening_reached=0.0)
+    motion = replace(STACK, waypoints=(replace(still, name="over"), PUT))
+    demonstrations = make_demonstrations(motion)
+    (shown,) = demonstrations.demonstrations
+    over, put = shown.waypoints
+    X_WE = RigidTransform(RotationMatrix.MakeZRotation(turned), np.zeros(3)).GetAsMatrix4()
+    shown = replace(shown, waypoints=(over, replace(put, X_WE=X_WE)))
+    demonstrations = DemonstrationSet("stack", (shown,))
+    machine = PolicyMachine(
+        motion=motion,
+        inference=LocalInference(Both(), demonstrations.contexts),
+        demonstrations=demonstrations,
+        gripper=lambda opening: GRIPPER,
+        solve=lambda X_WE, near: near,
+    )
+    memory, _ = run(machine, FakeInputs())
+    assert memory.status.phase is Phase.DONE, memory.status.reason
+    assert memory.chosen[1].mode == (1 if turned == 0.0 else 0)
+    assert memory.chosen[1].X_WE.IsNearlyEqualTo(modes["second"][memory.chosen[1].mode], 1e-12)
 
 
 def test_a_descent_that_touches_goes_on_from_where_it_stopped():

@@ -20,7 +20,7 @@ from iga_drake.station.scenario import (
 
 SHIPPED = (
     "grasp", "stack", "hang", "insert", "pour", "sweep", "pick_and_stack", "pick_and_insert",
-    "field", "hardware", "one_of_everything",
+    "field", "hardware", "one_of_everything", "ycb_fruit",
 )  # fmt: skip
 # Time steps (s) other than the default.
 TIME_STEPS = {"pour": 0.0025, "sweep": 0.005, "pick_and_stack": 0.004, "pick_and_insert": 0.004}

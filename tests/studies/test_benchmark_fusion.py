@@ -21,6 +21,7 @@ def test_times_every_contender_in_one_run(capsys):
         assert 0 < figures["min_ms"] <= figures["median_ms"] <= figures["max_ms"]
         if "whole" in name:  # all see the same surfaces; ours drops the pixels at jumps
             assert 0.9 < figures["points"] / ours["points"] < 1.1
+    assert result["geometric labels"]["points"] > 2000  # of the ball that stands
     lines = _table(result).splitlines()
     assert len(lines) == 2 + len(result)
     assert all(any(line.startswith(name) for line in lines) for name in result)

@@ -34,6 +34,8 @@ class ObjectNodes(NamedTuple):
 class FamiliarityNet(nn.Module):
     """Logistic regression on FIGURES; fitted by `iga train familiarity`."""
 
+    typical: Tensor  # (MATCHES,)
+
     def __init__(self) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.zeros(len(FIGURES)))

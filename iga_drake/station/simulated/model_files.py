@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import unquote, urlparse
+from xml.sax.saxutils import escape
 
 import numpy as np
 import trimesh
@@ -185,48 +186,63 @@ def _kept(text: str, name: str, file: Path | str) -> Path:
 
 
 def _usable(text: str, where: str, folder: Path | None, packages: Mapping[str, Path]) -> str:
-    """SDF or URDF text with absolute URIs and meshes that Drake takes."""
+    """SDF or URDF text with absolute URIs and meshes that Drake takes; the rest as it was."""
     try:
-        root = ElementTree.fromstring(text.strip())
+        # Only looked at: prefixes that files use without declaring them are no matter.
+        root = ElementTree.fromstring(re.sub(r"(</?\w+):(\w)", r"\1_\2", text.strip()))
     except ElementTree.ParseError as error:
         raise StationError(
             f"{where}: not XML ({error}): an SDF or URDF model, or a .dmd.yaml file, is expected"
         ) from error
-    tag = root.tag.rpartition("}")[2]
-    if tag not in ("sdf", "robot"):
+    if root.tag not in ("sdf", "robot"):
         raise StationError(
-            f"{where}: its root is <{tag}>: <sdf> or <robot> (URDF) is expected; export the model "
-            "as one of these"
+            f"{where}: its root is <{root.tag}>: <sdf> or <robot> (URDF) is expected; export the "
+            "model as one of these"
         )
-    if not root.findall("link" if tag == "robot" else ".//link") and not root.findall(".//include"):
+    if root.find(".//link") is None and root.find(".//include") is None:
         raise StationError(f"{where}: it has no <link>: nothing to simulate; name another model")
-    ElementTree.register_namespace("drake", "http://drake.mit.edu")
+    drawn: dict[str, bool] = {}
+    for uri, look in _mesh_uris(root):
+        drawn[uri] = drawn.get(uri, False) or look
     try:
-        for element, key, drawn in _mesh_uris(root):
-            uri = (element.get(key) if key else element.text) or ""
-            usable = f"file://{_usable_mesh(resolve_uri(uri.strip(), folder, packages), drawn)}"
-            if key:
-                element.set(key, usable)
-            else:
-                element.text = usable
-        for link in root.iter("link"):
-            _check_inertial(link, tag)
+        for uri, look in drawn.items():
+            file = _usable_mesh(resolve_uri(uri, folder, packages), look)
+            text = _with_uri(text, uri, file)
+        for include in root.iter("include"):
+            uri = (include.findtext("uri") or "").strip()
+            text = _with_uri(text, uri, _included(resolve_uri(uri, folder, packages), packages))
+        if re.search(r"<static>\s*(true|1)", text) is None:
+            for link in root.iter("link"):
+                _check_inertial(link, root.tag)
     except StationError as error:
         raise StationError(f"{where}: {error}") from error
-    return ElementTree.tostring(root, encoding="unicode")
+    return text
 
 
-def _mesh_uris(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str, bool]]:
-    """Element, attribute ("": its text) and whether it is only drawn, of each mesh's URI."""
+def _with_uri(text: str, uri: str, file: Path) -> str:
+    """XML text in which `uri` is that of a file, as an element's text or a mesh's file name."""
+    quoted = re.escape(escape(uri))
+    new = escape(f"file://{file}")
+    text = re.sub(rf"(<uri>\s*){quoted}(\s*</uri>)", lambda m: m[1] + new + m[2], text)
+    return re.sub(rf"""(filename\s*=\s*["']){quoted}(["'])""", lambda m: m[1] + new + m[2], text)
+
+
+def _included(path: Path, packages: Mapping[str, Path]) -> Path:
+    """A usable copy of a model that another includes: a file, or a folder with model.sdf."""
+    file = path / "model.sdf" if path.is_dir() else path
+    return _kept(read_model(file, packages), file.stem, file)
+
+
+def _mesh_uris(root: ElementTree.Element) -> Iterator[tuple[str, bool]]:
+    """The URI of each mesh, and whether it is drawn there."""
     for owner in root.iter():
         if owner.tag not in ("visual", "collision"):
             continue
         for mesh in owner.iter("mesh"):
-            drawn = owner.tag == "visual"
-            if mesh.get("filename") is not None:
-                yield mesh, "filename", drawn
-            for uri in mesh.iter("uri"):
-                yield uri, "", drawn
+            uris = [mesh.get("filename"), *(uri.text for uri in mesh.iter("uri"))]
+            for uri in uris:
+                if uri is not None:
+                    yield uri.strip(), owner.tag == "visual"
 
 
 def _check_inertial(link: ElementTree.Element, tag: str) -> None:
@@ -407,11 +423,13 @@ def add_object(plant: MultibodyPlant, item: SceneObject) -> AddedObject:
         else:
             kind = "urdf" if "<robot" in text[:2000] else "sdf"
             added = parser.AddModelsFromString(text, kind)
-            if len(added) != 1:
+            names = {plant.GetModelInstanceName(instance): instance for instance in added}
+            tops = [n for n in names if not any(n.startswith(f"{other}::") for other in names)]
+            if len(tops) != 1:
                 raise StationError(
-                    f"{where}: it holds {len(added)} models, 1 is expected: make each an object"
+                    f"{where}: it holds {len(tops)} models, 1 is expected: make each an object"
                 )
-            _rename(plant, item.name, added[0], first)
+            _rename(plant, item.name, names[tops[0]], first)
     except (RuntimeError, ValueError) as error:
         raise StationError(f"{where}: {_reason(error)}; mend it") from error
     instances = [ModelInstanceIndex(index) for index in range(first, plant.num_model_instances())]
@@ -480,9 +498,8 @@ def _placed(
             ) from error
     else:
         base = roots[0]
-    for body in bodies:
-        if not fixed and body.default_mass() <= 0 and body.index() == base.index():
-            raise StationError(f"{where}: link '{body.name()}' has no mass: state <inertial>")
+    if not fixed and not sum(body.default_mass() for body in bodies) > 0:
+        raise StationError(f"{where}: link '{base.name()}' has no mass: state <inertial>")
     if not fixed and not any(plant.GetCollisionGeometriesForBody(body) for body in bodies):
         raise StationError(
             f"{where}: it has no <collision>, so it would fall through the table: add one, or make "
@@ -600,17 +617,16 @@ def check_object(
     unstated = [body.name() for body in added.bodies if _has_default_inertia(body)]
     if unstated and not added.fixed and gyration > _GYRATION * np.linalg.norm(size) / 2:
         raise StationError(
-            f"{source}: link '{unstated[0]}' states no mass and inertia, and 1 kg with a radius of "
-            f"gyration of 1 m, which Drake would take, can't be those of something "
-            f"{np.linalg.norm(size):.3g} m large: state <inertial>, or name its mesh file as the "
-            "object, with a density or mass"
+            f"{source}: link '{unstated[0]}' states no inertia, and 1 kg m^2, which Drake would "
+            f"take, can't be that of something {np.linalg.norm(size):.3g} m large: state "
+            "<inertial>, or name its mesh file as the object, with a density or mass"
         )
     return MassProperties(kilograms, np.asarray(inertia.get_com()), np.asarray(central))
 
 
 def _has_default_inertia(body: RigidBody) -> bool:
-    """Whether it has the mass and inertia of an SDF link that states none."""
-    if body.default_mass() != 1.0:
+    """Whether it has the inertia of an SDF link that states none."""
+    if not body.default_mass() > 0:
         return False
     moments = body.default_spatial_inertia().CalcRotationalInertia().get_moments()
     return bool(np.allclose(moments, 1.0))
@@ -659,6 +675,7 @@ def _corners(inspector: SceneGraphInspector, geometry: GeometryId, source: str) 
     if isinstance(shape, Convex | Mesh):
         hull = shape.GetConvexHull()
         return np.array([hull.vertex(index) for index in range(hull.num_vertices())])
+    if isinstance(shape, HalfSpace):  # endless: what of it may be under things
+        return trimesh.creation.box((1.0, 1.0, 1e-3)).vertices
     kind = type(shape).__name__
-    extra = ": a half space has no end, use a box" if isinstance(shape, HalfSpace) else ""
-    raise StationError(f"{source}: geometry of the kind {kind} can't be used{extra}")
+    raise StationError(f"{source}: geometry of the kind {kind} can't be used: make it a mesh")

@@ -70,6 +70,12 @@ GOOD = {
     "without_normals.sdf": _sdf(_link(_mesh("bare.obj"))),
     "stl.sdf": _sdf(_link(_mesh("cube.stl"))),
     "glb.sdf": _sdf(_link(_mesh("cube.glb"))),
+    "include.sdf": _sdf("<include><name>inner</name><uri>relative.sdf</uri></include>"),
+    "prefix.sdf": _sdf(_link(_PLAIN)).replace(
+        "</geometry></collision>",
+        "</geometry><drake:proximity_properties><drake:mu_dynamic>0.7</drake:mu_dynamic>"
+        "</drake:proximity_properties></collision>",
+    ),
     "package.urdf": _urdf("package://our_models/cube.obj"),
     "relative.urdf": _urdf("cube.stl"),
     "two_links.sdf": TWO_LINKS,
@@ -133,12 +139,12 @@ def test_all_fall_freely_and_rest_on_the_table(folder: Path):
     drop = 0.05
     added = {}
     for index, name in enumerate(GOOD):
-        X_WO = RigidTransform([0.15 * index - 0.6, 0.0, EDGE / 2 + drop])
+        X_WO = RigidTransform([0.15 * index - 0.8, 0.0, EDGE / 2 + drop])
         item = SceneObject(f"thing_{index}", "other", read_model(folder / name), X_WO, name)
         added[name] = add_object(plant, item)
     plant.Finalize()
     for index, thing in enumerate(added.values()):
-        p = [0.15 * index - 0.6, 0.0, EDGE / 2 + drop]
+        p = [0.15 * index - 0.8, 0.0, EDGE / 2 + drop]
         plant.SetDefaultFloatingBaseBodyPose(thing.base, RigidTransform(p))
     simulator = Simulator(builder.Build())
     context = plant.GetMyContextFromRoot(simulator.get_context())
@@ -226,7 +232,7 @@ REFUSED = {
     "format.sdf": (_sdf(_link(_mesh("format.sdf"))), "'.sdf' can't be read; use one of .obj"),
     "no_inertial.sdf": (
         _sdf(_link(_PLAIN, inertial="")),
-        "'cube' states no mass.*state <inertial>",
+        "'cube' states no inertia.*state <inertial>",
     ),
     "massless.sdf": (_sdf(_link(_PLAIN).replace(f"<mass>{MASS}", "<mass>0")), "0 kg.*> 0"),
     "inertia.sdf": (_sdf(_link(_PLAIN, inertial=_BAD)), "principal moments.*compute them anew"),
