@@ -28,7 +28,7 @@ from iga_drake.systems.geometric_segmentation import CameraView, SegmentedViews
 from iga_drake.systems.ports import Role
 from iga_drake.tasks.distractors import with_distractors
 from iga_drake.tasks.episode import TEST_SEED_OFFSET, demonstrations_path
-from iga_drake.tasks.registry import make_task
+from iga_drake.tasks.registry import scenario_task
 from iga_drake.viewing.figures import check_figure, new_figure, write_figure
 
 _COUNTED = {"target": Role.TARGET, "grasped": Role.GRASPED}
@@ -103,7 +103,7 @@ class SegmentationResult:
 def render_views(scenario: Scenario, seed: int) -> Iterator[RenderedViews]:
     """The looks at one scene of the scenario's task, test objects; the arm doesn't move, but is put
     to where the object in the hand is shown."""
-    task = make_task(scenario.task.name)
+    task = scenario_task(scenario)
     scene = with_distractors(task.scene(seed), scenario.distractors, seed)
     station = make_station(scenario, scene=scene, seed=seed + TEST_SEED_OFFSET)
     context = station.CreateDefaultContext()
@@ -153,7 +153,7 @@ def measure_segmentation(
 ) -> SegmentationResult:
     """Counts the points of the looks at the scenes with these seeds; `png`: a picture of the last
     look's labels, the true ones above those found."""
-    task = make_task(scenario.task.name)
+    task = scenario_task(scenario)
     demonstrations = read_demonstrations(demonstrations_path(scenario), task=task.name)
     demonstrations = demonstrations.first(min(scenario.context_size, len(demonstrations)))
     segmenter = make_segmenter(scenario, demonstrations)

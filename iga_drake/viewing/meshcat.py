@@ -47,7 +47,7 @@ class Visualization:
 
 
 # Where one looks from and at (m, in W), and how wide (degrees, from top to bottom).
-_CAMERA, _CAMERA_TARGET, _CAMERA_FIELD = [1.75, -0.95, 0.95], [0.22, 0.0, 0.27], 40.0
+_CAMERA, _CAMERA_TARGET, _CAMERA_FIELD = [1.75, -0.95, 0.95], [0.22, 0.0, 0.33], 40.0
 _NEWTONS_PER_METER, _LEAST_FORCE = 200.0, 0.5  # N/m, N
 _CONTACT_PERIOD = 0.1  # s at least: one contact is many numbers in a recording
 _POLL = 0.02  # s between two looks at the buttons or at the connections

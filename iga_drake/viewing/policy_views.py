@@ -362,7 +362,7 @@ _NO_STATUS = PolicyStatus(
 _FRUSTUM_COLOR = Rgba(0.25, 0.25, 0.3, 1.0)
 # The text hangs before the camera, so near that nothing comes between: left, top, width of a pixel.
 _TEXT_PATH = "/Cameras/default/rotated/<object>/text"
-_TEXT_DISTANCE, _TEXT_PIXEL, _TEXT_TOP = 0.1, 0.1 * 6.2e-4, 0.1 * 0.355
+_TEXT_DISTANCE, _TEXT_PIXEL, _TEXT_TOP = 0.1, 0.1 * 5.0e-4, 0.1 * 0.358
 _TEXT_SIZE, _TEXT_LENGTH = 28, 66  # px of the letters, characters of a line
 
 

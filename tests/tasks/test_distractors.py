@@ -17,7 +17,7 @@ def _meshes(scene) -> dict[str, trimesh.Trimesh]:
     """The visual meshes of the scene's objects in W."""
     meshes = {}
     for item in scene.objects:
-        uri = item.sdf.split("<visual")[1].split("<uri>file://")[1].split("</uri>")[0]
+        uri = item.model.split("<visual")[1].split("<uri>file://")[1].split("</uri>")[0]
         mesh = trimesh.load_mesh(uri)
         meshes[item.name] = mesh.apply_transform(item.X_WO.GetAsMatrix4())
     return meshes
@@ -50,9 +50,9 @@ def test_they_are_a_pure_function_of_the_seed(scene, tmp_path):
     first, again = (with_distractors(scene, 2, seed=5, mesh_folder=tmp_path) for _ in range(2))
     other = with_distractors(scene, 2, seed=6, mesh_folder=tmp_path)
     for one, two in zip(first.objects, again.objects, strict=True):
-        assert one.sdf == two.sdf
+        assert one.model == two.model
         assert one.X_WO.IsExactlyEqualTo(two.X_WO)
-    assert first.objects[-1].sdf != other.objects[-1].sdf
+    assert first.objects[-1].model != other.objects[-1].model
     assert with_distractors(scene, 0, seed=5) is scene
 
 
@@ -63,7 +63,7 @@ def test_families_of_the_task_are_left_out(tmp_path):
     assert "mug" in {shape.family for shape in scene.truth.shapes.values()}
     for seed in range(3):
         crowded = with_distractors(scene, 3, seed, mesh_folder=tmp_path)
-        folders = [item.sdf for item in crowded.objects[len(scene.objects) :]]
+        folders = [item.model for item in crowded.objects[len(scene.objects) :]]
         assert not any("/mug" in sdf for sdf in folders)
 
 
