@@ -47,7 +47,7 @@ check: develop
 	$(BIN)/mypy
 
 docs: develop
-	$(BIN)/python -m mkdocs build --quiet --strict --config-file .ci/mkdocs.yml --site-dir $(CURDIR)/outputs/site
+	$(BIN)/python -m mkdocs build --strict --config-file .ci/mkdocs.yml --site-dir $(CURDIR)/outputs/site
 	@echo "outputs/site/index.html"
 
 test: check docs $(VENV)/.browser

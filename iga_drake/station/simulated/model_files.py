@@ -589,7 +589,8 @@ def check_object(
     """The mass and inertia of an object's links together, in the base body's frame.
 
     Args:
-      inspector, context: of the finished plant; the context is the plant's own.
+      inspector: of the finished plant.
+      context: of the plant itself in the finished diagram.
       source: names the object in messages.
 
     Raises `StationError` where the object is larger than one on a table can be, or a free one
