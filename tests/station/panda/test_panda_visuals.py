@@ -9,7 +9,7 @@ from iga_drake.station.panda import visuals as panda_visuals
 
 
 def test_converted_mesh_keeps_its_shape_with_y_up(tmp_path):
-    near = 3e-4  # m, by which fewer faces may be off
+    near = 1e-3  # m, by which fewer faces may be off
     source = panda_visuals._source_dir() / "finger.dae"
     panda_visuals._convert(source, tmp_path / "finger.gltf")
     assert [p.name for p in tmp_path.iterdir()] == ["finger.gltf"]
