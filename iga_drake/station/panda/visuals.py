@@ -19,10 +19,10 @@ _MESHES = {
     "panda_leftfinger": "finger",
     "panda_rightfinger": "finger",
 }
-_VERSION = "3"  # of the conversion
+_VERSION = "4"  # of the conversion
 # Share of the triangles of a part that are dropped if it has more than few, where the package
 # fast-simplification is there; angle (rad) from which on an edge is seen as one.
-_SHARE_DROPPED, _FEW_FACES, _CREASE = 0.75, 300, math.radians(35.0)
+_SHARE_DROPPED, _FEW_FACES, _CREASE = 0.75, 1500, math.radians(35.0)
 
 
 def _source_dir() -> Path | None:

@@ -9,16 +9,15 @@ from iga_drake.station.panda import visuals as panda_visuals
 
 
 def test_converted_mesh_keeps_its_shape_with_y_up(tmp_path):
-    near = 1e-3  # m, by which fewer faces may be off
     source = panda_visuals._source_dir() / "finger.dae"
     panda_visuals._convert(source, tmp_path / "finger.gltf")
     assert [p.name for p in tmp_path.iterdir()] == ["finger.gltf"]
     (low, high), (x, y, z) = trimesh.load_scene(source).bounds, (0, 1, 2)
     bounds = trimesh.load_scene(tmp_path / "finger.gltf").bounds
     # glTF's y is the file's z, and glTF's z is the file's -y.
-    np.testing.assert_allclose(bounds[:, x], [low[x], high[x]], atol=near)
-    np.testing.assert_allclose(bounds[:, y], [low[z], high[z]], atol=near)
-    np.testing.assert_allclose(bounds[:, z], [-high[y], -low[y]], atol=near)
+    np.testing.assert_allclose(bounds[:, x], [low[x], high[x]], atol=1e-6)
+    np.testing.assert_allclose(bounds[:, y], [low[z], high[z]], atol=1e-6)
+    np.testing.assert_allclose(bounds[:, z], [-high[y], -low[y]], atol=1e-6)
     # Drake reads it as a visual, and turns it back.
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, 0.0)
