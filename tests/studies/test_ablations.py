@@ -39,7 +39,7 @@ SETUP = Setup(
     voting=VotingConfig(triplets=48, parts=8),
     energy=ENERGY_SIZES,
     energy_training=EnergyTraining(
-        batch=2, problems=2, modes_problems=0, foreign_problems=0, negatives=32, log_every=1
+        batch=2, problems=2, modes_problems=0, negatives=32, log_every=1
     ),
     descriptor=SMALL,
     descriptor_training=DescriptorTraining(
