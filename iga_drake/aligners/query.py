@@ -1,14 +1,15 @@
 """The question that an aligner is measured by: aligned pairs, the last of them taken apart."""
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from iga_drake.aligners.protocol import Aligner, PoseEstimate
-from iga_drake.dataset.alignment_error import random_pose
-from iga_drake.dataset.field_versions import field_clouds
-from iga_drake.dataset.samples import Sample
 from iga_drake.demonstrations.alignment import Alignment
+
+if TYPE_CHECKING:
+    from iga_drake.dataset.samples import Sample
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class Query:
 
 
 def sample_query(
-    sample: Sample, split: str, index: int, *, up: bool = False, field: str = ""
+    sample: "Sample", split: str, index: int, *, up: bool = False, field: str = ""
 ) -> Query:
     """The query about sample `index` of a set that every aligner gets.
 
@@ -87,6 +88,10 @@ def sample_query(
       up: give the directions that are up, of the objects that have one.
       field: disturb the clouds in this way, one of FIELD_KINDS; none: clean clouds.
     """
+    # Not before it is needed: aligners are listed without the packages that samples are made with.
+    from iga_drake.dataset.alignment_error import random_pose
+    from iga_drake.dataset.field_versions import field_clouds
+
     A, B = (each if up and each.any(1).all() else None for each in sample.up.astype(np.float64))
     start = random_pose(index)
     query = Query.of(sample.points, start, grasped_up=A, target_up=B)

@@ -35,7 +35,11 @@ from iga_drake.systems.ports import Role
 Images = dict[str, tuple[np.ndarray, np.ndarray, RigidTransform]]
 
 _BALL = """<sdf version="1.10"><model name="ball"><link name="ball">
+  <inertial><mass>0.2</mass><inertia>
+    <ixx>0.0004</ixx><iyy>0.0004</iyy><izz>0.0004</izz><ixy>0</ixy><ixz>0</ixz><iyz>0</iyz>
+  </inertia></inertial>
   <visual name="v"><geometry><sphere><radius>0.07</radius></sphere></geometry></visual>
+  <collision name="c"><geometry><sphere><radius>0.07</radius></sphere></geometry></collision>
 </link></model></sdf>"""
 
 

@@ -121,6 +121,6 @@ def test_weights_are_part_of_the_key(tmp_path: Path) -> None:
     assert icp == {"aligner": "icp", "options": {"starts": 8}, "weights": ""}
     keys = [
         aligner_key(make_aligner("iga", **options), "iga", {})["weights"]
-        for options in ({}, {"energy": None})
+        for options in ({}, {"familiarity": None})
     ]
     assert keys[0].startswith(keys[1] + "+")

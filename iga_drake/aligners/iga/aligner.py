@@ -184,11 +184,14 @@ class IgaAligner:
         if isinstance(familiarity, (str, Path)):
             path = Path(familiarity)
             familiarity, card = load_familiarity(path)
+            digests.append(file_digest(path))
             if card.get("descriptor") != digests[0]:
                 raise CheckpointError(
                     f"{path}: fitted to the descriptors {shortened(card.get('descriptor'))}, in "
                     f"use are {digests[0]}: fit it again with `iga train familiarity`"
                 )
+        elif familiarity is not None:
+            digests.append(network_digest(familiarity))
         if self.config.ranking == "vote":
             energy = None
         elif energy is None:
