@@ -59,7 +59,8 @@ _EXTRAS = {
 
 
 def missing_extra(error: ImportError) -> str:
-    """What to install where an import of an optional package failed; empty where it was none."""
+    """The line of advice for a failed import of an optional package: what to install. Empty for any
+    other package."""
     module = (error.name or "").partition(".")[0]
     if module not in _EXTRAS:
         return ""

@@ -174,7 +174,8 @@ def _simulate(
 
 
 def _pacer(simulator: "Simulator", buttons: "RunButtons", rate: float | None) -> Callable[[], bool]:
-    """What a live episode asks before each step: waits while paused, and keeps to the rate."""
+    """A function to call before each step of a live episode: it waits while the episode is paused,
+    keeps to the rate, and returns whether the episode goes on."""
     if rate is None:
         rate = 1.0 if sys.stdin is not None and sys.stdin.isatty() else 0.0
     simulator.set_target_realtime_rate(rate)

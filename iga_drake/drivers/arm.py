@@ -1,4 +1,4 @@
-"""What a driver needs of an arm and of a hand, whichever library speaks to them."""
+"""Interfaces of an arm and of a hand that a driver process uses, one class for each library."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -30,7 +30,7 @@ class Arm(Protocol):
 
     @property
     def running(self) -> bool:
-        """Whether it follows targets."""
+        """Whether the arm follows targets."""
         ...
 
     def start(self) -> None:
@@ -58,7 +58,7 @@ class Hand(Protocol):
     """A gripper whose motions take their time. Errors are `DriverError`."""
 
     def opening(self) -> float:
-        """Measured (m)."""
+        """The measured opening (m)."""
         ...
 
     def move(self, opening: float) -> None:

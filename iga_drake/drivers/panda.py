@@ -27,7 +27,7 @@ _RECOVERY = 1.0  # s between two attempts
 
 @dataclass
 class DriverLimits:
-    """What the driver lets through."""
+    """Limits of the commands that a driver passes on to the arm."""
 
     # A command whose stamp differs by more (s) from this machine's clock is dropped.
     expiry: float = 0.05

@@ -82,6 +82,7 @@ class _View(LeafSystem):
         self._meshcat.SetProperty(path, "visible", False, context.get_time())
 
     def _publish(self, context: Context) -> None:
+        """Draws what is new. Every view has its own: Drake's systems can't be abstract classes."""
         raise NotImplementedError
 
 

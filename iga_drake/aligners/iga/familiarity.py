@@ -1,4 +1,6 @@
-"""Whether the demonstrations show objects like the one at hand, told from descriptors and sizes.
+"""Familiarity: how sure it is that the demonstrations show objects like a test object.
+
+It is computed from descriptors and sizes.
 
 A test object is familiar when its nodes match the demonstrations' nodes as well as these match each
 other. The comparison makes symmetric objects, whose matches are ambiguous by nature, as familiar as
