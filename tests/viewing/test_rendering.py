@@ -27,5 +27,5 @@ def test_no_vendor_of_egl_is_refused_before_anything_renders(tmp_path):
 
 def test_no_library_of_egl_is_refused(monkeypatch):
     monkeypatch.setattr(rendering.ctypes.util, "find_library", lambda _: "libEGL-missing.so.1")
-    with pytest.raises(RenderingError, match="libEGL-missing.so.1 is missing"):
+    with pytest.raises(RenderingError, match=r"libEGL-missing\.so\.1 is missing"):
         check_egl()
