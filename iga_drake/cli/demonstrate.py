@@ -1,14 +1,26 @@
 """`iga demonstrate`: the scripted expert records demonstrations."""
 
 import argparse
+import multiprocessing
+import os
+import signal
 import sys
+import threading
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from iga_drake.cli.options import seed
 from iga_drake.cli.scenarios import add_scenario_arguments, scenario_of
 from iga_drake.cli.status import SUCCESS, CommandError
 
+if TYPE_CHECKING:
+    from iga_drake.demonstrations.demonstration import Demonstration
+    from iga_drake.demonstrations.recording import Recording
+
 MOST = 10_000
+_ATTEMPTS = 8  # of one process: Drake keeps some 60 MB of every diagram with Python's systems
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,15 +55,60 @@ def run(arguments: argparse.Namespace) -> int:
         )
     key = {"scenario": scenario.digest, "seed": arguments.seed, "code": code_version()}
     recording = Recording(arguments.out, task=task, key=key)
+    pool = ProcessPoolExecutor(
+        1,
+        multiprocessing.get_context("spawn"),
+        initializer=_end_with_parent,
+        max_tasks_per_child=_ATTEMPTS,
+    )
+
+    def attempt(seed: int) -> "Demonstration | None":
+        try:
+            pool.submit(_attempt, arguments, recording, seed).result()
+        except BrokenProcessPool as error:
+            raise CommandError(
+                f"seed {seed}: the process of the attempt ended at once (killed, or out of "
+                "memory?): the same command goes on from there"
+            ) from error
+        return recording.get(seed)
+
     try:
         demonstrations = record_demonstrations(
-            scenario, count=arguments.count, first_seed=arguments.seed, recording=recording
+            scenario,
+            count=arguments.count,
+            first_seed=arguments.seed,
+            recording=recording,
+            attempt=attempt,
         )
     except KeyboardInterrupt:
         again = "the same command goes on from there"
         print(f"{recording.kept} demonstrations are kept: {again}", file=sys.stderr)
         raise
+    finally:
+        for process in multiprocessing.active_children():
+            process.kill()
+        pool.shutdown(cancel_futures=True)
     write_demonstrations(arguments.out, demonstrations)
     recording.end()
     print(f"{len(demonstrations)} demonstrations of '{demonstrations.task}' in {arguments.out}")
     return SUCCESS
+
+
+def _attempt(arguments: argparse.Namespace, recording: "Recording", seed: int) -> None:
+    """One attempt, kept in the recording."""
+    from iga_drake.tasks.episode import attempt_demonstration
+
+    recording.add(seed, attempt_demonstration(scenario_of(arguments), seed))
+
+
+def _end_with_parent() -> None:
+    """Ends this process as soon as the one that started it does; Ctrl-C is that one's matter."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()

@@ -12,6 +12,7 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
 
 from iga_drake.aligners.protocol import Aligner, PoseEstimate
 from iga_drake.aligners.registry import EXPERT, ORACLE, PRIVILEGED, check_aligner
@@ -234,7 +235,7 @@ class Episode:
     """A task on one seeded scene, in simulation: step it, run it to its end, judge it.
 
     Use it as a context manager, or call `close`: an aligner given by name runs in a process of its
-    own, which is ended then (at the latest when Python ends).
+    own, which is ended then (at the latest when Python ends), and the diagram's state is let go.
 
     Args:
       scenario: how the diagram is wired.
@@ -246,7 +247,8 @@ class Episode:
       meshcat: where to show it, and what the policy sees, infers and is about to do.
 
     Raises:
-      IgaDrakeError: bad input. An episode that fails is a result, not an error.
+      IgaDrakeError: bad input, or asked about the present after `close`. An episode that fails is a
+        result, not an error.
     """
 
     def __init__(
@@ -330,8 +332,11 @@ class Episode:
         self._begin()
 
     def close(self) -> None:
-        """Ends the aligner's process."""
+        """Ends the aligner's process and lets go of the diagram's state, some hundred MB that Drake
+        keeps otherwise for as long as Python runs: Python's systems are never collected. What was
+        seen before (`snapshots`, a result) stays."""
         self.inference.close()
+        self.simulator.reset_context(None)
 
     def __enter__(self) -> "Episode":
         return self
@@ -346,9 +351,15 @@ class Episode:
 
     # The state now
 
+    @property
+    def _context(self) -> Context:
+        if not self.simulator.has_context():
+            raise TaskError(f"{self.task.name}, seed {self.seed}: the episode is closed")
+        return self.simulator.get_context()
+
     def snapshot(self) -> Snapshot:
         """The true state now; nothing of it reaches the policy."""
-        context = self._plant.GetMyContextFromRoot(self.simulator.get_context())
+        context = self._plant.GetMyContextFromRoot(self._context)
         return read_snapshot(self._plant, context, self._panda)
 
     @property
@@ -360,7 +371,7 @@ class Episode:
     def memory(self) -> PolicyMemory:
         """The policy's whole state at the present time."""
         policy = self.robot.policy
-        return policy.memory(policy.GetMyContextFromRoot(self.simulator.get_context()))
+        return policy.memory(policy.GetMyContextFromRoot(self._context))
 
     @property
     def status(self) -> PolicyStatus:
@@ -370,7 +381,7 @@ class Episode:
     @property
     def time(self) -> float:
         """Simulated time (s)."""
-        return self.simulator.get_context().get_time()
+        return self._context.get_time()
 
     @property
     def over(self) -> bool:
@@ -580,6 +591,14 @@ def _name_alignment(result: EpisodeResult) -> EpisodeResult:
     return replace(result, cause=Cause.ALIGNMENT, reason=reason)
 
 
+def attempt_demonstration(
+    scenario: Scenario, seed: int, on_event: Callable[[str], None] | None = print
+) -> Demonstration | None:
+    """One episode of the expert on demonstration objects; None where it failed."""
+    with Episode(scenario, seed=seed, aligner=EXPERT, split="demonstration") as episode:
+        return episode.demonstration() if episode.run(on_event).success else None
+
+
 def record_demonstrations(
     scenario: Scenario,
     *,
@@ -587,10 +606,14 @@ def record_demonstrations(
     first_seed: int = 0,
     on_event: Callable[[str], None] | None = print,
     recording: Recording | None = None,
+    attempt: Callable[[int], Demonstration | None] | None = None,
 ) -> DemonstrationSet:
     """Lets the expert do the task on demonstration objects until `count` episodes succeeded.
 
-    Attempts that `recording` holds are taken from there, the others are kept in it.
+    Attempts that `recording` holds are taken from there, the others are kept in it. `attempt` does
+    the one with a seed: `attempt_demonstration` by default, in this process, which keeps some 60 MB
+    of each.
+
     Raises `TaskError` if more than half of the attempts fail.
     """
     if count < 1:
@@ -605,9 +628,11 @@ def record_demonstrations(
         if recording is not None and before:
             found = recording.get(seed)
         else:
-            with Episode(scenario, seed=seed, aligner=EXPERT, split="demonstration") as episode:
-                found = episode.demonstration() if episode.run(on_event).success else None
-            if recording is not None:
+            if attempt is None:
+                found = attempt_demonstration(scenario, seed, on_event)
+            else:
+                found = attempt(seed)
+            if recording is not None and not recording.done(seed):
                 recording.add(seed, found)
             ran += 1
         if found is not None:
