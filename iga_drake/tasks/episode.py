@@ -34,6 +34,7 @@ from iga_drake.policy.inference import (
 )
 from iga_drake.policy.machine import PolicyMemory
 from iga_drake.policy.motion import Phase, PhaseEntry, PolicyStatus, WaypointMotion
+from iga_drake.station.log.writer import EpisodeLogWriter
 from iga_drake.station.make import make_station
 from iga_drake.station.panda.model import find_panda
 from iga_drake.station.scenario import Scenario
@@ -221,6 +222,42 @@ class ExpertInference:
         """Does nothing: there is no process to end."""
 
 
+@dataclass(frozen=True)
+class LogRequest:
+    """Where to record an episode's raw log, and how often (s) to record images that nobody looks
+    at, of cameras that make them when they are asked for; None: not at all."""
+
+    path: Path
+    image_period: float | None = None
+
+
+def begin_log(
+    request: LogRequest,
+    scenario: Scenario,
+    *,
+    task: str,
+    aligner: str,
+    seed: int,
+    draws: int,
+    split: str,
+) -> EpisodeLogWriter:
+    """Begins the raw log of an episode that starts now; `draws` is the seed of what the aligner
+    draws. Raises `OutputError` and `EpisodeLogError`."""
+    start = wall.time()
+    metadata = {
+        "task": task,
+        "aligner": aligner,
+        "seed": str(seed),
+        "split": split,
+        "draws": str(draws),
+        "start": repr(start),
+        "code": code_version(),
+        "scenario_digest": scenario.digest,
+        "scenario": scenario.to_yaml(),
+    }
+    return EpisodeLogWriter(request.path, metadata=metadata, start=start)
+
+
 def demonstrations_path(scenario: Scenario) -> Path:
     """The folder of the scenario's demonstrations; relative paths start at `models/`, `~` is the
     user's home."""
@@ -244,6 +281,7 @@ class Episode:
       split: whose objects: "test" (never demonstrated) or "demonstration".
       demonstrations: the aligner's context; default: the scenario's folder.
       meshcat: where to show it, and what the policy sees, infers and is about to do.
+      record: where to keep a raw log; None keeps none. It ends where the episode begins again.
 
     Raises:
       IgaDrakeError: bad input. An episode that fails is a result, not an error.
@@ -258,6 +296,7 @@ class Episode:
         split: Split = "test",
         demonstrations: DemonstrationSet | None = None,
         meshcat: Meshcat | None = None,
+        record: LogRequest | None = None,
     ) -> None:
         began = wall.perf_counter()
         self.scenario, self.seed, self.split = scenario, seed, split
@@ -276,7 +315,14 @@ class Episode:
         # Other draws of calibration and noise than any demonstration's with the same seed.
         draws = seed + (TEST_SEED_OFFSET if split == "test" else 0)
         self.inference = self._make_inference(chosen)
+        self.log: EpisodeLogWriter | None = None
         try:
+            if record is not None:
+                name = self.inference.name
+                self.log = begin_log(
+                    record, scenario, task=self.task.name, aligner=name, seed=seed, draws=draws,
+                    split=split,
+                )  # fmt: skip
             self.robot: RobotDiagram = build_robot_diagram(
                 scenario,
                 make_station(scenario, scene=self.scene, seed=draws, meshcat=meshcat),
@@ -285,6 +331,8 @@ class Episode:
                 demonstrations=self.demonstrations,
                 seed=draws,
                 meshcat=meshcat,
+                log=self.log,
+                image_period=None if record is None else record.image_period,
             )
             station = self.robot.station
             if station.HasSubsystemNamed("simulated"):  # behind the hardware station
@@ -300,7 +348,7 @@ class Episode:
             self._build_seconds = wall.perf_counter() - began
             self._begin()
         except BaseException:
-            self.inference.close()
+            self.close()
             raise
 
     def _make_inference(self, aligner: str | Aligner) -> Inference:
@@ -326,12 +374,16 @@ class Episode:
     def restart(self) -> None:
         """Begins again at time 0 with the same scene and draws: the same episode once more."""
         self.inference.cancel()
+        if self.log is not None:
+            self.log.close()
         self.simulator.reset_context(self.robot.diagram.CreateDefaultContext())
         self._begin()
 
     def close(self) -> None:
-        """Ends the aligner's process."""
+        """Ends the aligner's process and the log."""
         self.inference.close()
+        if self.log is not None:
+            self.log.close()
 
     def __enter__(self) -> "Episode":
         return self
@@ -423,6 +475,9 @@ class Episode:
                     on_event(f"  {entry}")
             shown = len(timeline)
         result = self.judge()
+        if self.log is not None:
+            row = result.row()
+            self.log.log("/verdict", self.time, lambda: row)
         if on_event:
             on_event(str(result))
         return result
