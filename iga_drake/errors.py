@@ -54,6 +54,7 @@ _EXTRAS = {
     "mcap": "record",
     "mcap_protobuf": "record",
     "open3d": "icp",
+    "pyarrow": "lerobot",
     "ray": "cluster",
     "tensorboard": "train",
     "torch_geometric": "geometric",

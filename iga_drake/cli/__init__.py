@@ -42,6 +42,7 @@ COMMANDS = {
     "drive": "drivers beside the hardware: the Panda",
     "view": "look at demonstrations, logs, shapes, samples, deformations",
     "evaluate": "tasks, alignments and where their errors come from, deformations",
+    "export": "raw logs in the formats of others: LeRobot",
     "benchmark": "time a part",
     "shapes": "list families, write them as SDF, read meshes",
     "dataset": "write samples to files, print their digests",

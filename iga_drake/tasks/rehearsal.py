@@ -36,7 +36,7 @@ from iga_drake.station.hardware.boot import boot_panda
 from iga_drake.station.hardware.calibration import CameraCalibration, write_calibration
 from iga_drake.station.hardware.images import CHANNEL, encode_images
 from iga_drake.station.hardware.station import build_hardware_station
-from iga_drake.station.lcm import decoded, utime_of
+from iga_drake.station.lcm import check_receive_buffer, decoded, udp_url, utime_of
 from iga_drake.station.panda import messages
 from iga_drake.station.panda.driver import connect_server
 from iga_drake.station.panda.messages import ControlMode
@@ -44,6 +44,7 @@ from iga_drake.station.panda.model import find_panda
 from iga_drake.station.panda.server import PandaServer, add_panda_server
 from iga_drake.station.scenario import Scenario, load_scenario
 from iga_drake.station.simulated.station import build_simulation_station
+from iga_drake.systems.messages import Cause
 from iga_drake.tasks.arm_episode import ArmEpisode, ArmResult
 from iga_drake.tasks.distractors import with_distractors
 from iga_drake.tasks.episode import (
@@ -56,7 +57,6 @@ from iga_drake.tasks.episode import (
 from iga_drake.tasks.registry import scenario_task
 from iga_drake.tasks.snapshots import Snapshot, read_snapshot
 from iga_drake.tasks.task import Split
-from iga_drake.systems.messages import Cause
 
 STATE_CHANNEL = "REHEARSAL_STATE"  # the simulated plant's positions, for the cameras alone
 _STATE_PERIOD = 1.0 / 30.0  # s
@@ -453,7 +453,8 @@ def rehearse(
     task = scenario_task(scenario)
     if scenario.aligner.name == ORACLE:
         raise RehearsalError("the oracle knows the clouds' true shapes, not those behind LCM")
-    url = f"udpm://239.255.76.67:{20_000 + os.getpid() % 20_000}?ttl=0"
+    url = udp_url(20_000 + os.getpid() % 20_000)
+    check_receive_buffer(url)
     clock = RehearsalClock(wall.time(), rate)
     scenario = replace(scenario, lcm_buses={"default": DrakeLcmParams(lcm_url=url)})
     driver = replace(scenario.model_drivers["panda"], lcm_bus="default")

@@ -18,7 +18,7 @@ from iga_drake.station.contract import StationError
 from iga_drake.station.hardware.boot import boot_panda
 from iga_drake.station.hardware.calibration import read_calibration
 from iga_drake.station.hardware.images import CHANNEL, ImageReceiver
-from iga_drake.station.lcm import Clock, add_subscriber, wall_clock
+from iga_drake.station.lcm import Clock, add_subscriber, check_receive_buffer, wall_clock
 from iga_drake.station.panda.client import PandaClient, PandaStart, add_panda_client
 from iga_drake.station.scenario import Scenario
 from iga_drake.systems.ports import camera_ports
@@ -34,6 +34,7 @@ def make_hardware_station(
     Raises `StationError` and `CalibrationFileError`, which say what is wrong and what to do.
     """
     _check_buses(scenario)
+    check_receive_buffer(scenario.lcm_buses[scenario.hardware.camera_bus].lcm_url)
     driver = scenario.model_drivers["panda"]
     lcm = DrakeLcm(scenario.lcm_buses[driver.lcm_bus])
     start = boot_panda(lcm, driver, limit=scenario.hardware.boot_limit)

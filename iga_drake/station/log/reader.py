@@ -90,6 +90,11 @@ class EpisodeLog:
             return None
         return messages.read_color(message) if kind == "color" else messages.read_raw(message, kind)
 
+    def jpeg(self, camera: str, index: int) -> bytes | None:
+        """The colour image of a camera's frame as it is in the file; None where it was dropped."""
+        message = self._file.at(f"/{camera}/color", self.frames[camera][index].recorded)
+        return None if message is None else message.data
+
     def scenario(self) -> Scenario:
         """The scenario that the episode was recorded with."""
         with tempfile.TemporaryDirectory() as folder:

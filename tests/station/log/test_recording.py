@@ -10,73 +10,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
-from robot_stub import make_scenario, stub_station
+from stub_log import END, START, build, memory, record
 
-from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.errors import IgaDrakeError
-from iga_drake.policy.inference import LocalInference
 from iga_drake.policy.motion import Phase
 from iga_drake.station.contract import check_port_contract
 from iga_drake.station.log.player import make_log_station
 from iga_drake.station.log.reader import EpisodeLog, read_episode_log
 from iga_drake.station.log.writer import EpisodeLogError, EpisodeLogWriter
 from iga_drake.station.scenario import Scenario
-from iga_drake.tasks.grasp import Grasp
-from iga_drake.tasks.robot_diagram import RobotDiagram, build_robot_diagram
 
 mcap_reader = pytest.importorskip("mcap.reader")
-START, END = 1.7e9, 1.2  # s
-
-
-class Above:
-    """An aligner that wants the hand above the target's middle, turned as its points lie."""
-
-    name = "above"
-
-    def align(self, context, grasped, target, *, grasped_up=None, target_up=None, seed=0):
-        X = np.diag([1.0, -1.0, -1.0, 1.0])
-        X[:3, 3] = target.mean(0) + [0, 0, 0.12]
-        poses = np.stack([X, X])
-        poses[1, 2, 3] += float(np.std(target))
-        return PoseEstimate(poses, np.array([-1.0, 0.5]), np.array([0.7, 0.3]))
-
-
-def build(scenario: Scenario, station: Any, **options: Any) -> tuple[RobotDiagram, Simulator]:
-    built = build_robot_diagram(
-        scenario,
-        station,
-        motion=Grasp.motion,
-        inference=LocalInference(Above(), [()]),
-        demonstrations=None,
-        **options,
-    )
-    simulator = Simulator(built.diagram)
-    simulator.Initialize()
-    return built, simulator
-
-
-def memory(built: RobotDiagram, simulator: Simulator) -> Any:
-    return built.policy.memory(built.policy.GetMyContextFromRoot(simulator.get_context()))
-
-
-def short_scenario() -> Scenario:
-    scenario = make_scenario()
-    scenario.policy.observe_settle = 0.3
-    return scenario
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, Path, Any]:
     """The scenario, its log, and the policy's memory at the end."""
     path = tmp_path_factory.mktemp("log") / "stub.mcap"
-    scenario = short_scenario()
-    metadata = {"scenario": scenario.to_yaml(), "task": "grasp", "start": repr(START)}
-    with EpisodeLogWriter(path, metadata=metadata, start=START) as log:
-        built, simulator = build(scenario, stub_station(scenario), log=log)
-        simulator.AdvanceTo(END)
-    assert (log.problem, log.dropped) == ("", 0)
-    return scenario, path, memory(built, simulator)
+    scenario, last = record(path, END)
+    return scenario, path, last
 
 
 @pytest.fixture(scope="module")
@@ -140,13 +92,8 @@ def test_the_diagram_infers_the_same_from_the_log(recorded: Any, log: EpisodeLog
 
 
 def test_images_are_recorded_as_often_as_asked_for(tmp_path: Path):
-    scenario = short_scenario()
-    path = tmp_path / "often.mcap"
-    metadata = {"scenario": scenario.to_yaml(), "start": repr(START)}
-    with EpisodeLogWriter(path, metadata=metadata, start=START) as log:
-        _, simulator = build(scenario, stub_station(scenario), log=log, image_period=0.2)
-        simulator.AdvanceTo(0.65)
-    times = [frame.recorded for frame in read_episode_log(path).frames["right"]]
+    record(tmp_path / "often.mcap", 0.65, image_period=0.2)
+    times = [frame.recorded for frame in read_episode_log(tmp_path / "often.mcap").frames["right"]]
     assert times == pytest.approx([0.0, 0.2, 0.3, 0.5])
 
 
