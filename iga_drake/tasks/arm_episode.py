@@ -69,10 +69,7 @@ class ArmResult:
             "opening": self.opening,
             "lag": list(self.lag),
             "waypoints": [],
-            "timeline": [
-                {"time": e.time, "phase": e.phase.value, "subject": e.subject, "detail": e.detail}
-                for e in self.timeline
-            ],
+            "timeline": [e.row() for e in self.timeline],
         }
 
     def __str__(self) -> str:

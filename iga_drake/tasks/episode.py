@@ -160,15 +160,7 @@ class EpisodeResult:
             "build_seconds": self.build_seconds,
             "measures": {name: float(value) for name, value in self.measures.items()},
             "waypoints": [waypoint.row() for waypoint in self.waypoints],
-            "timeline": [
-                {
-                    "time": entry.time,
-                    "phase": entry.phase.value,
-                    "subject": entry.subject,
-                    "detail": entry.detail,
-                }
-                for entry in self.timeline
-            ],
+            "timeline": [entry.row() for entry in self.timeline],
         }
 
     def __str__(self) -> str:

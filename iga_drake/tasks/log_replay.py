@@ -95,10 +95,7 @@ def log_row(log: EpisodeLog) -> Mapping[str, Any]:
         "reason": status.reason if ended else "the log breaks off",
         "simulated_seconds": log.duration,
         "waypoints": [],
-        "timeline": [
-            {"time": e.time, "phase": e.phase.value, "subject": e.subject, "detail": e.detail}
-            for e in status.timeline
-        ],
+        "timeline": [e.row() for e in status.timeline],
     }
 
 

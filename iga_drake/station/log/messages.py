@@ -146,10 +146,7 @@ def status_values(status: PolicyStatus) -> dict[str, Any]:
         "cause": None if status.cause is None else status.cause.value,
         "waits_for": status.waits_for,
         "step": status.step,
-        "timeline": [
-            {"time": e.time, "phase": e.phase.value, "subject": e.subject, "detail": e.detail}
-            for e in status.timeline
-        ],
+        "timeline": [e.row() for e in status.timeline],
         "waypoints_reached": [X.GetAsMatrix4() for X in status.waypoints_reached],
         "times_reached": list(status.times_reached),
         "inference_seconds": list(status.inference_seconds),
