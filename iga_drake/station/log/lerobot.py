@@ -30,7 +30,7 @@ _JOINTS = [f"joint_{k}" for k in range(PANDA_JOINTS)]
 _POSE = ["x", "y", "z", "roll", "pitch", "yaw"]
 
 
-class ExportError(IgaDrakeError):
+class LerobotExportError(IgaDrakeError):
     """Logs can't be written as the dataset that was asked for."""
 
 
@@ -61,13 +61,13 @@ def export_lerobot(
       cameras: other names for cameras in the dataset, such as DROID's "exterior_1_left".
       on_event: called with a line for each episode.
 
-    Raises `ExportError` for a log without images or of other cameras than the first, `OutputError`
-    for a folder that is there, and `ExportError` without the extra `lerobot`.
+    Raises `LerobotExportError` for a log without images or of other cameras than the first and
+    without the extra `lerobot`, `OutputError` for a folder that is there.
     """
     try:
         import pyarrow.parquet  # noqa: F401
     except ImportError as error:
-        raise ExportError(missing_extra(error) or error_text(error)) from error
+        raise LerobotExportError(missing_extra(error) or error_text(error)) from error
     check_range(1 <= fps <= 200, "fps", fps, "1 to 200")
     check_output_folder(folder)
     if folder.exists():
@@ -81,7 +81,7 @@ def export_lerobot(
         writer.add(columns, images, words, log.path)
         on_event(f"{log.path}: {len(columns['timestamp'])} frames")
     if writer is None:
-        raise ExportError("no log was given")
+        raise LerobotExportError("no log was given")
     writer.finish()
     return ExportedDataset(folder, writer.episodes, writer.frames)
 
@@ -91,13 +91,17 @@ def _frames(
 ) -> tuple[dict[str, np.ndarray], dict[str, list[bytes]]]:
     """Columns (T, ...) of one episode, and of each camera T JPEGs."""
     for name in set(names) - set(log.frames):
-        raise ExportError(f"{log.path}: no images of camera '{name}': {', '.join(log.frames)}")
+        raise LerobotExportError(
+            f"{log.path}: no images of camera '{name}': {', '.join(log.frames)}"
+        )
     if not log.frames:
-        raise ExportError(f"{log.path}: holds no images: record with --image-period, say 0.1")
+        raise LerobotExportError(
+            f"{log.path}: holds no images: record with --image-period, say 0.1"
+        )
     first = max(frames[0].recorded for frames in log.frames.values())
     times = first + np.arange(max(int((log.duration - first) * fps) + 1, 0)) / fps
     if len(times) < 2:
-        raise ExportError(f"{log.path}: ends before there is an image of each camera")
+        raise LerobotExportError(f"{log.path}: ends before there is an image of each camera")
     robot = make_panda_planning_robot(log.scenario().table)
 
     def rows(port: str) -> np.ndarray:
@@ -221,7 +225,7 @@ class _DatasetWriter:
         extra = {"language_instruction", "episode_index", "index", "task_index"}
         found, wanted = {*columns, *images}, set(self._features) - extra
         if found != wanted:
-            raise ExportError(
+            raise LerobotExportError(
                 f"{path}: other cameras than the first log's: {', '.join(sorted(found ^ wanted))}"
             )
         if task not in self._tasks:
