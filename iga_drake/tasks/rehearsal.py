@@ -440,11 +440,12 @@ def rehearse(
     image_period: float = 0.25,
     record: LogRequest | None = None,
     on_event: Callable[[str], None] | None = None,
+    proceed: Callable[[], bool] | None = None,
 ) -> RehearsalResult:
     """Runs one episode on a cell of processes, through LCM, at `rate`.
 
     Boot checks, calibration files, hardware station, supervisor, policy and aligner are those of
-    the real arm. The aligner may be "expert".
+    the real arm. The aligner may be "expert". `on_event` and `proceed` are `ArmEpisode.run`'s.
 
     Raises `RehearsalError`, and what `ArmEpisode` raises.
     """
@@ -495,7 +496,7 @@ def rehearse(
             rate=rate,
             record=record,
         ) as episode:
-            result = episode.run(on_event, after_done=AFTER_DONE)
+            result = episode.run(on_event, proceed=proceed, after_done=AFTER_DONE)
             snapshots = cell.ask("arm", "snapshots")
             scene = with_distractors(
                 task.scene(seed + scenario.seeds.scene, split),

@@ -13,13 +13,22 @@ from iga_drake.tasks.rehearsal import RehearsalClock, rehearse, timing_of
 def test_a_cell_of_processes_is_booted_seen_and_commanded():
     scenario = load_scenario(
         "grasp", "hardware",
-        overrides=["segmentation.source=truth", "aligner.name=expert", "task.time_limit=1.0",
+        overrides=["segmentation.source=truth", "aligner.name=expert",
                    "panda.visuals=primitives"],
     )  # fmt: skip
     for camera in scenario.cameras.values():
         camera.intrinsics = Intrinsics(160, 120, fx=154.0, fy=154.0, cx=79.5, cy=59.5)
     scenario.policy.minimum_points = 8
-    rehearsed = rehearse(scenario, rate=0.1)
+    said: list[str] = []
+    moving: list[None] = []
+
+    def proceed() -> bool:
+        """Until it has moved for a while, however long the first image takes."""
+        if any("move grasp" in line for line in said):
+            moving.append(None)
+        return len(moving) < 10
+
+    rehearsed = rehearse(scenario, rate=0.1, on_event=said.append, proceed=proceed)
     phases = [entry.phase for entry in rehearsed.result.timeline]
     assert phases[:3] == [Phase.OBSERVE, Phase.INFER, Phase.MOVE], rehearsed.result
     assert rehearsed.timing.count > 20

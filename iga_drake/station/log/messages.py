@@ -185,9 +185,13 @@ def estimate_values(name: str, estimate: PoseEstimate) -> dict[str, Any]:
 
 def read_estimate(values: Mapping[str, Any]) -> PoseEstimate:
     """The answer of `estimate_values`."""
-    fields = ("poses", "energies", "probabilities", "familiarity")
-    arrays = {name: None if values[name] is None else np.array(values[name]) for name in fields}
-    return PoseEstimate(**arrays)
+    known = values["familiarity"]
+    return PoseEstimate(
+        poses=np.array(values["poses"]),
+        energies=np.array(values["energies"]),
+        probabilities=np.array(values["probabilities"]),
+        familiarity=None if known is None else np.array(known),
+    )
 
 
 def chosen_values(name: str, chosen: ReachablePose) -> dict[str, Any]:

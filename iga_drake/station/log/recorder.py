@@ -1,6 +1,7 @@
 """Records what a station delivers, what it is told, and what the policy makes of it."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -215,27 +216,24 @@ class EpisodeRecorder(LeafSystem):
         told = 0 if before is None else len(before.timeline)
         if self._is_new("status", status):
             for entry in status.timeline[told:]:
-                line, bad = str(entry), entry.phase in (Phase.REFUSED, Phase.FAILED)
-                log("/log", now, lambda line=line, bad=bad: messages.line_message(line, bad=bad))
-            log("/policy/status", now, lambda: messages.status_values(status))
+                bad = entry.phase in (Phase.REFUSED, Phase.FAILED)
+                log("/log", now, partial(messages.line_message, str(entry), bad=bad))
+            log("/policy/status", now, partial(messages.status_values, status))
         for name, seen in self._read(context, "observations").items():
             if self._is_new(f"observed {name}", seen.time):
-                log(f"/observed/{name}", now, lambda seen=seen: messages.cloud_message(seen))
-                log("/policy/observation", now,
-                    lambda name=name, seen=seen: messages.observation_values(name, seen)
-                    )  # fmt: skip
+                log(f"/observed/{name}", now, partial(messages.cloud_message, seen))
+                values = partial(messages.observation_values, name, seen)
+                log("/policy/observation", now, values)
         names = [waypoint.name for waypoint in self._motion.waypoints]
-        for kind, values in (("estimate", messages.estimate_values),
-                             ("chosen", messages.chosen_values)):  # fmt: skip
-            found = self._read(context, "estimates" if kind == "estimate" else "chosen")
-            for index, each in enumerate(found):
-                if self._is_new(f"{kind} {index}", True):
-                    name = names[index]
-                    log(f"/policy/{kind}", now,
-                        lambda v=values, n=name, e=each: v(n, e))  # fmt: skip
+        for name, estimate in zip(names, self._read(context, "estimates"), strict=False):
+            if self._is_new(f"estimate {name}", True):
+                log("/policy/estimate", now, partial(messages.estimate_values, name, estimate))
+        for name, chosen in zip(names, self._read(context, "chosen"), strict=False):
+            if self._is_new(f"chosen {name}", True):
+                log("/policy/chosen", now, partial(messages.chosen_values, name, chosen))
         holds: SupervisorStatus = self._read(context, "supervisor.status")
         if self._is_new("supervisor", holds):
-            log("/supervisor", now, lambda: messages.supervisor_values(holds))
+            log("/supervisor", now, partial(messages.supervisor_values, holds))
 
 
 def add_recorder(
