@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import Meshcat
+from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, Multiplexer
@@ -37,7 +37,9 @@ def replay_log(log: EpisodeLog, meshcat: Meshcat) -> None:
     scenario = log.scenario()
     motion = scenario_task(scenario).motion
     builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
+    scene_graph = builder.AddSystem(SceneGraph())
+    plant = MultibodyPlant(0.0)  # for its geometry alone: nothing is simulated
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
     panda = add_panda(plant)
     plant.Finalize()
     player = builder.AddNamedSystem("player", LogPlayer(log, scenario))

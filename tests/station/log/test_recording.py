@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from stub_log import END, START, build, memory, record
 
+from iga_drake import cli
 from iga_drake.errors import IgaDrakeError
 from iga_drake.policy.motion import Phase
 from iga_drake.station.contract import check_port_contract
@@ -172,3 +173,11 @@ def test_a_log_is_never_written_over(recorded: Any, tmp_path: Path):
     for path, reason in ((recorded[1], "not overwritten"), (tmp_path / "a.bag", "ends with .mcap")):
         with pytest.raises(IgaDrakeError, match=reason):
             EpisodeLogWriter(path, metadata={}, start=0.0)
+
+
+def test_a_log_is_told_and_replayed(recorded: Any, tmp_path: Path, capsys: pytest.CaptureFixture):
+    page = tmp_path / "replay.html"
+    assert cli.main(["view", "log", str(recorded[1]), "--html", str(page)]) == cli.SUCCESS
+    told = capsys.readouterr().out
+    assert "infer grasp" in told and "images: left 1, right 1" in told
+    assert page.stat().st_size > 100_000
