@@ -36,10 +36,13 @@ _OUTSIDE = {
 # Each is a module of this package with `add_arguments(parser)` and `run(arguments) -> int`.
 COMMANDS = {
     "simulate": "run one episode of a scenario",
+    "rehearse": "run one through LCM and the hardware station, on a simulated cell",
+    "run": "run one on the arm",
     "demonstrate": "let the scripted expert record demonstrations",
     "drive": "drivers beside the hardware: the Panda",
-    "view": "look at demonstrations, shapes, samples, deformations",
+    "view": "look at demonstrations, logs, shapes, samples, deformations",
     "evaluate": "tasks, alignments and where their errors come from, deformations",
+    "export": "raw logs in the formats of others: LeRobot",
     "benchmark": "time a part",
     "shapes": "list families, write them as SDF, read meshes",
     "dataset": "write samples to files, print their digests",

@@ -30,6 +30,7 @@ SUBCOMMANDS = {
     "familiarity": Subcommand(
         "iga_drake.studies.familiarity", "how often own objects are refused, foreign ones accepted"
     ),
+    "log": Subcommand("iga_drake.cli.evaluate_log", "poses inferred again from raw logs"),
     "scaling": Subcommand(
         "iga_drake.studies.scaling", "time and memory by number of demonstrations",
         "add_evaluate_scaling", "evaluate_scaling",

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from iga_drake.cli.options import add_aligner_options, aligner_options, seed
+from iga_drake.cli.recording import add_record_arguments, log_request, tell_of_log
 from iga_drake.cli.scenarios import (
     add_demonstrations_argument,
     add_scenario_arguments,
@@ -65,17 +66,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--png", type=Path, metavar="OUT", help="write a picture of every phase (needs matplotlib)"
     )
+    add_record_arguments(parser)
     parser.add_argument("--result", type=Path, metavar="JSON", help="write the result as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Runs the episode, tells how it goes, writes what was asked for."""
+    from iga_drake.station.log.writer import check_new_log
     from iga_drake.viewing.figures import check_figure
 
     check_output(arguments.html)  # before minutes of simulation
     check_output(arguments.png)
     check_figure(arguments.png)
     check_output(arguments.result, begins=(b'{"task"',))
+    check_new_log(arguments.record)
     scenario = scenario_of(arguments)
     name = arguments.aligner or scenario.aligner.name
     scenario = with_aligner(scenario, name, aligner_options(arguments, [name])[name])
@@ -117,6 +121,7 @@ def _simulate_live(arguments: argparse.Namespace, scenario: "Scenario") -> int:
         if not buttons.restarts:
             return status
         seed += 1
+        arguments.record = None  # the log is of the first
 
 
 def _simulate(
@@ -136,7 +141,8 @@ def _simulate(
         from iga_drake.viewing.replay import begin_recording
 
         begin_recording(meshcat, live=live)
-    with Episode(scenario, seed=seed, split=split, meshcat=meshcat) as episode:
+    record = log_request(arguments)
+    with Episode(scenario, seed=seed, split=split, meshcat=meshcat, record=record) as episode:
         name = scenario.aligner.name
         print(f"{episode.task.name}, seed {seed}, aligner {name}, {split} objects", flush=True)
         if arguments.demonstrations and episode.demonstrations is not None:
@@ -153,6 +159,7 @@ def _simulate(
         if buttons is not None:
             run["proceed"] = _pacer(episode.simulator, buttons, arguments.realtime)
         result = episode.run(**run)
+    tell_of_log(episode.log)
     if buttons is not None and (buttons.restarts or buttons.ends):
         return FAILURE
     if strip is not None:

@@ -1,4 +1,4 @@
-"""`iga view`: demonstrations, shapes, samples, deformations, energies, reconstructions."""
+"""`iga view`: demonstrations, logs, shapes, samples, deformations, energies, reconstructions."""
 
 import argparse
 
@@ -6,6 +6,7 @@ from iga_drake.cli.subcommands import Subcommand, add_subcommands, run_subcomman
 
 SUBCOMMANDS = {
     "demonstrations": Subcommand("iga_drake.cli.view_demonstrations", "clouds and waypoints in 3D"),
+    "log": Subcommand("iga_drake.cli.view_log", "the raw log of an episode, as it went"),
     "shapes": Subcommand(
         "iga_drake.viewing.shape_sheets", "a contact sheet for each family",
         "add_view_shapes", "view_shapes",

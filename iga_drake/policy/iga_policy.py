@@ -43,6 +43,7 @@ class IgaPolicy(LeafSystem):
         - chosen
         - energies
         - steps
+        - next_look
 
     - `target_cloud`, `grasped_cloud` (PointCloud, m in W): what the cameras see of each role.
     - `camera_counts` (dict of camera name -> `CameraCounts`): a camera with a problem is waited
@@ -56,6 +57,7 @@ class IgaPolicy(LeafSystem):
     - `energies` (T): energy of the pose chosen for each waypoint; NaN before there is one.
     - `steps` (tuple of `MotionStep`): what is left of the motion under way, the present step first;
       empty while nothing moves.
+    - `next_look` (1, s): when the policy looks at the cameras next; infinity while it has not to.
     """
 
     def __init__(self, machine: PolicyMachine) -> None:
@@ -100,6 +102,9 @@ class IgaPolicy(LeafSystem):
             prerequisites_of_calc=state,
         )
         declare("steps", (), _steps_left)
+        self.DeclareVectorOutputPort(
+            "next_look", 1, self._calc_next_look, prerequisites_of_calc=state
+        )
         self.DeclarePeriodicUnrestrictedUpdateEvent(machine.config.period, 0.0, self._update)
 
     def memory(self, context: Context) -> PolicyMemory:
@@ -112,6 +117,11 @@ class IgaPolicy(LeafSystem):
         for index, chosen in enumerate(self.memory(context).chosen):
             energies[index] = chosen.energy
         output.SetFromVector(energies)
+
+    def _calc_next_look(self, context: Context, output: Any) -> None:
+        memory = self.memory(context)
+        looks = memory.status.phase is Phase.OBSERVE
+        output.SetFromVector([memory.observe_next if looks else np.inf])
 
     def _update(self, context: Context, state: State) -> None:
         memory = self._machine.advance(

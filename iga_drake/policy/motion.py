@@ -58,6 +58,15 @@ class PhaseEntry:
     # Result of the phase before (points seen, mode chosen) or reason of a failure, in words.
     detail: str = ""
 
+    def row(self) -> dict[str, str | float]:
+        """The entry as plain JSON values."""
+        return {
+            "time": self.time,
+            "phase": self.phase.value,
+            "subject": self.subject,
+            "detail": self.detail,
+        }
+
     def __str__(self) -> str:
         detail = f"  ({self.detail})" if self.detail else ""
         return f"{self.time:6.2f} s  {self.phase.value} {self.subject}".rstrip() + detail

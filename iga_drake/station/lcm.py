@@ -2,6 +2,8 @@
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from pydrake.common.value import AbstractValue
@@ -9,6 +11,11 @@ from pydrake.lcm import DrakeLcmInterface
 from pydrake.systems.framework import Context, DiagramBuilder, InputPort
 from pydrake.systems.lcm import LcmSubscriberSystem, PySerializer
 
+from iga_drake.station.contract import StationError
+
+_BUFFER = 4 * 2**20  # bytes that LCM is to ask the system for: a few images of each camera
+_LEAST_BUFFER = 2**20
+_BUFFER_FILE = Path("/proc/sys/net/core/rmem_max")
 # From the diagram's context to wall-clock time (s since 1970); a test may have a clock of its own.
 Clock = Callable[[Context], float]
 
@@ -16,6 +23,25 @@ Clock = Callable[[Context], float]
 def wall_clock(context: Context) -> float:
     """The machine's clock (s since 1970), whatever the diagram's time is."""
     return time.time()
+
+
+def udp_url(port: int) -> str:
+    """LCM's URL on this machine alone, with a buffer that holds images."""
+    return f"udpm://239.255.76.67:{port}?ttl=0&recv_buf_size={_BUFFER}"
+
+
+def check_receive_buffer(url: str, *, file: Path = _BUFFER_FILE) -> None:
+    """Raises `StationError` where the system (`file`) gives programs so small a buffer for what
+    they receive over UDP that images get lost."""
+    if not url.startswith("udpm://"):
+        return
+    with suppress(OSError, ValueError):  # another kind of system
+        most = int(file.read_text(encoding="ascii"))
+        if most < _LEAST_BUFFER:
+            raise StationError(
+                f"net.core.rmem_max is {most} bytes: camera images would be lost on their way "
+                f"over UDP; allow more: sudo sysctl -w net.core.rmem_max={2 * _BUFFER}"
+            )
 
 
 def utime_of(seconds: float) -> int:

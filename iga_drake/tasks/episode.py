@@ -35,6 +35,7 @@ from iga_drake.policy.inference import (
 )
 from iga_drake.policy.machine import PolicyMemory
 from iga_drake.policy.motion import Phase, PhaseEntry, PolicyStatus, WaypointMotion
+from iga_drake.station.log.writer import EpisodeLogWriter
 from iga_drake.station.make import make_station
 from iga_drake.station.panda.model import find_panda
 from iga_drake.station.scenario import Scenario
@@ -160,15 +161,7 @@ class EpisodeResult:
             "build_seconds": self.build_seconds,
             "measures": {name: float(value) for name, value in self.measures.items()},
             "waypoints": [waypoint.row() for waypoint in self.waypoints],
-            "timeline": [
-                {
-                    "time": entry.time,
-                    "phase": entry.phase.value,
-                    "subject": entry.subject,
-                    "detail": entry.detail,
-                }
-                for entry in self.timeline
-            ],
+            "timeline": [entry.row() for entry in self.timeline],
         }
 
     def __str__(self) -> str:
@@ -222,6 +215,42 @@ class ExpertInference:
         """Does nothing: there is no process to end."""
 
 
+@dataclass(frozen=True)
+class LogRequest:
+    """Where to record an episode's raw log, and how often (s) to record images that nobody looks
+    at, of cameras that make them when they are asked for; None: not at all."""
+
+    path: Path
+    image_period: float | None = None
+
+
+def begin_log(
+    request: LogRequest,
+    scenario: Scenario,
+    *,
+    task: str,
+    aligner: str,
+    seed: int,
+    draws: int,
+    split: str,
+) -> EpisodeLogWriter:
+    """Begins the raw log of an episode that starts now; `draws` is the seed of what the aligner
+    draws. Raises `OutputError` and `EpisodeLogError`."""
+    start = wall.time()
+    metadata = {
+        "task": task,
+        "aligner": aligner,
+        "seed": str(seed),
+        "split": split,
+        "draws": str(draws),
+        "start": repr(start),
+        "code": code_version(),
+        "scenario_digest": scenario.digest,
+        "scenario": scenario.to_yaml(),
+    }
+    return EpisodeLogWriter(request.path, metadata=metadata, start=start)
+
+
 def demonstrations_path(scenario: Scenario) -> Path:
     """The folder of the scenario's demonstrations; relative paths start at `models/`, `~` is the
     user's home."""
@@ -245,6 +274,7 @@ class Episode:
       split: whose objects: "test" (never demonstrated) or "demonstration".
       demonstrations: the aligner's context; default: the scenario's folder.
       meshcat: where to show it, and what the policy sees, infers and is about to do.
+      record: where to keep a raw log; None keeps none. It ends where the episode begins again.
 
     Raises:
       IgaDrakeError: bad input, or asked about the present after `close`. An episode that fails is a
@@ -260,6 +290,7 @@ class Episode:
         split: Split = "test",
         demonstrations: DemonstrationSet | None = None,
         meshcat: Meshcat | None = None,
+        record: LogRequest | None = None,
     ) -> None:
         began = wall.perf_counter()
         self.scenario, self.seed, self.split = scenario, seed, split
@@ -278,7 +309,14 @@ class Episode:
         # Other draws of calibration and noise than any demonstration's with the same seed.
         draws = seed + (TEST_SEED_OFFSET if split == "test" else 0)
         self.inference = self._make_inference(chosen)
+        self.log: EpisodeLogWriter | None = None
         try:
+            if record is not None:
+                name = self.inference.name
+                self.log = begin_log(
+                    record, scenario, task=self.task.name, aligner=name, seed=seed, draws=draws,
+                    split=split,
+                )  # fmt: skip
             self.robot: RobotDiagram = build_robot_diagram(
                 scenario,
                 make_station(scenario, scene=self.scene, seed=draws, meshcat=meshcat),
@@ -287,6 +325,8 @@ class Episode:
                 demonstrations=self.demonstrations,
                 seed=draws,
                 meshcat=meshcat,
+                log=self.log,
+                image_period=None if record is None else record.image_period,
             )
             station = self.robot.station
             if station.HasSubsystemNamed("simulated"):  # behind the hardware station
@@ -302,7 +342,7 @@ class Episode:
             self._build_seconds = wall.perf_counter() - began
             self._begin()
         except BaseException:
-            self.inference.close()
+            self.close()
             raise
 
     def _make_inference(self, aligner: str | Aligner) -> Inference:
@@ -328,14 +368,18 @@ class Episode:
     def restart(self) -> None:
         """Begins again at time 0 with the same scene and draws: the same episode once more."""
         self.inference.cancel()
+        if self.log is not None:
+            self.log.close()
         self.simulator.reset_context(self.robot.diagram.CreateDefaultContext())
         self._begin()
 
     def close(self) -> None:
-        """Ends the aligner's process and lets go of the diagram's state, some hundred MB that Drake
-        keeps otherwise for as long as Python runs: Python's systems are never collected. What was
-        seen before (`snapshots`, a result) stays."""
+        """Ends the aligner's process and the log, and lets go of the diagram's state, some hundred MB
+        that Drake keeps otherwise for as long as Python runs: Python's systems are never collected.
+        What was seen before (`snapshots`, a result) stays."""
         self.inference.close()
+        if self.log is not None:
+            self.log.close()
         self.simulator.reset_context(None)
 
     def __enter__(self) -> "Episode":
@@ -434,6 +478,9 @@ class Episode:
                     on_event(f"  {entry}")
             shown = len(timeline)
         result = self.judge()
+        if self.log is not None:
+            row = result.row()
+            self.log.log("/verdict", self.time, lambda: row)
         if on_event:
             on_event(str(result))
         return result

@@ -19,6 +19,8 @@ from iga_drake.policy.inference import Inference
 from iga_drake.policy.machine import PolicyMachine
 from iga_drake.policy.motion import TaskMotion
 from iga_drake.station.cameras.rgbd import camera_info
+from iga_drake.station.log.recorder import EpisodeRecorder, add_recorder
+from iga_drake.station.log.writer import EpisodeLogWriter
 from iga_drake.station.panda.model import gripper_cloud
 from iga_drake.station.panda.planning import make_panda_planning_robot
 from iga_drake.station.perception import add_fusion
@@ -86,6 +88,8 @@ def build_robot_diagram(
     demonstrations: DemonstrationSet | None,
     seed: int = 0,
     meshcat: Meshcat | None = None,
+    log: EpisodeLogWriter | None = None,
+    image_period: float | None = None,
 ) -> RobotDiagram:
     """Builds the whole robot around a station.
 
@@ -98,6 +102,9 @@ def build_robot_diagram(
         None takes the openings from `motion`.
       seed: of the aligner, with `scenario.seeds.aligner` added.
       meshcat: where to show what the policy sees, infers and is about to do; None shows nothing.
+      log: where to record it; None records nothing.
+      image_period: how often (s) to record images that nobody looks at, of cameras that make them
+        when they are asked for; None records those that the policy looks at.
 
     Where the arm starts is not asked: everything begins with the joints as first measured.
     """
@@ -145,6 +152,8 @@ def build_robot_diagram(
     for camera in scenario.camera_names:
         port = f"{camera}.time"
         builder.Connect(station.GetOutputPort(port), systems["supervisor"].GetInputPort(port))
+    if log is not None:
+        _add_recorder(builder, scenario, systems, motion, log, image_period)
     diagram = builder.Build()
     diagram.set_name("robot")
     return RobotDiagram(diagram=diagram, station=station, fusion=fusion, policy=policy)
@@ -176,3 +185,31 @@ def _add_views(
         demonstrations=demonstrations,
         period=scenario.visualization.publish_period,
     )
+
+
+def _add_recorder(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    systems: Mapping[str, Any],
+    motion: TaskMotion,
+    log: EpisodeLogWriter,
+    image_period: float | None,
+) -> None:
+    """Adds the recorder of the raw log."""
+    outputs = {}
+    for system in (systems["station"], systems["policy"]):
+        for i in range(system.num_output_ports()):
+            outputs[system.get_output_port(i).get_name()] = system.get_output_port(i)
+    outputs["panda.position"] = systems["supervisor"].GetOutputPort("position")
+    outputs["hand.opening"] = systems["follower"].GetOutputPort("hand.opening")
+    outputs["supervisor.status"] = systems["supervisor"].GetOutputPort("status")
+    outputs["pose_measured"] = systems["forward_kinematics"].GetOutputPort("pose")
+    recorder = EpisodeRecorder(
+        log,
+        {name: camera.intrinsics for name, camera in scenario.cameras.items()},
+        motion,
+        control_period=scenario.control.period,
+        policy_period=scenario.policy.period,
+        image_period=image_period,
+    )
+    add_recorder(builder, recorder, outputs)

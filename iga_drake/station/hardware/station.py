@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from drake import lcmt_image_array
 from pydrake.common.value import Value
 from pydrake.geometry import Meshcat
@@ -18,10 +19,13 @@ from iga_drake.station.contract import StationError
 from iga_drake.station.hardware.boot import boot_panda
 from iga_drake.station.hardware.calibration import read_calibration
 from iga_drake.station.hardware.images import CHANNEL, ImageReceiver
-from iga_drake.station.lcm import Clock, add_subscriber, wall_clock
+from iga_drake.station.lcm import Clock, add_subscriber, check_receive_buffer, wall_clock
 from iga_drake.station.panda.client import PandaClient, PandaStart, add_panda_client
 from iga_drake.station.scenario import Scenario
 from iga_drake.systems.ports import camera_ports
+
+_NEAREST = 0.1  # m before a camera
+_LEAST_SEEN = 0.05  # share of the work area that each camera has to see
 
 
 def make_hardware_station(
@@ -34,6 +38,7 @@ def make_hardware_station(
     Raises `StationError` and `CalibrationFileError`, which say what is wrong and what to do.
     """
     _check_buses(scenario)
+    check_receive_buffer(scenario.lcm_buses[scenario.hardware.camera_bus].lcm_url)
     driver = scenario.model_drivers["panda"]
     lcm = DrakeLcm(scenario.lcm_buses[driver.lcm_bus])
     start = boot_panda(lcm, driver, limit=scenario.hardware.boot_limit)
@@ -94,7 +99,30 @@ def _calibrated(scenario: Scenario, name: str) -> RigidTransform:
         intrinsics=scenario.cameras[name].intrinsics,
         age=scenario.hardware.calibration_age,
     )
+    _check_view(scenario, name, calibration.X_WC)
     return calibration.X_WC
+
+
+def _check_view(scenario: Scenario, name: str, X_WC: RigidTransform) -> None:
+    """Raises `StationError` for a camera that would see nearly nothing of the box in which the
+    fusion looks for objects, as with a pose that is inverted."""
+    k, fusion = scenario.cameras[name].intrinsics, scenario.fusion
+    axes = [
+        np.linspace(low, high, count)
+        for low, high, count in zip(fusion.crop_lower, fusion.crop_upper, (5, 5, 3), strict=True)
+    ]
+    p_W = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    x, y, z = X_WC.inverse().multiply(p_W.T)
+    before = z > _NEAREST
+    u = np.where(before, k.fx * x / np.where(before, z, 1.0) + k.cx, -1.0)
+    v = np.where(before, k.fy * y / np.where(before, z, 1.0) + k.cy, -1.0)
+    seen = before & (u >= 0) & (u < k.width) & (v >= 0) & (v < k.height)
+    if seen.mean() < _LEAST_SEEN:
+        raise StationError(
+            f"{name}: with the calibrated pose it would see {100 * seen.mean():.0f} % of the work "
+            f"area (fusion.crop_lower to crop_upper): is X_CW written in place of X_WC? Calibrate "
+            "the camera anew"
+        )
 
 
 def _add_camera(

@@ -70,13 +70,14 @@ class BadLinkServer(PandaServer):
 
 
 class BadLinkSender(ImageSender):
-    """A camera that sends nothing once it is `silent`."""
+    """A camera that sends nothing once it is `silent`, and whose messages go through `link`."""
 
     silent = False
+    link: Callable[[bytes], bytes] | None = None
 
     def send(self, context: Context, channel: str, data: bytes) -> None:
         if not self.silent:
-            super().send(context, channel, data)
+            super().send(context, channel, data if self.link is None else self.link(data))
 
 
 def add_arm(

@@ -1,0 +1,523 @@
+"""A rehearsal in real time: the arm's program on one side of LCM, a simulated cell on the other.
+
+The cell is three processes, as the real one is several machines: the arm with whatever lies before
+it, the cameras, and a monitor that notes when commands pass. Their clock is this machine's, or, at
+a rate below 1, one that runs slower by that rate, so that a machine that is too slow for the real
+pace can rehearse everything else: all limits are in seconds of that clock.
+"""
+
+import contextlib
+import datetime
+import multiprocessing
+import os
+import signal
+import tempfile
+import time as wall
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from drake import lcmt_drake_signal, lcmt_panda_command
+from pydrake.lcm import DrakeLcm, DrakeLcmParams
+from pydrake.math import RollPitchYaw
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.lcm import LcmBuses, LcmInterfaceSystem
+
+from iga_drake.aligners.registry import EXPERT, ORACLE
+from iga_drake.errors import IgaDrakeError, error_text
+from iga_drake.policy.inference import Inference
+from iga_drake.station.cameras.rgbd import Pose
+from iga_drake.station.hardware.boot import boot_panda
+from iga_drake.station.hardware.calibration import CameraCalibration, write_calibration
+from iga_drake.station.hardware.images import CHANNEL, encode_images
+from iga_drake.station.hardware.station import build_hardware_station
+from iga_drake.station.lcm import check_receive_buffer, decoded, udp_url, utime_of
+from iga_drake.station.panda import messages
+from iga_drake.station.panda.driver import connect_server
+from iga_drake.station.panda.messages import ControlMode
+from iga_drake.station.panda.model import find_panda
+from iga_drake.station.panda.server import PandaServer, add_panda_server
+from iga_drake.station.scenario import Scenario, load_scenario
+from iga_drake.station.simulated.station import build_simulation_station
+from iga_drake.systems.messages import Cause
+from iga_drake.tasks.arm_episode import ArmEpisode, ArmResult
+from iga_drake.tasks.distractors import with_distractors
+from iga_drake.tasks.episode import (
+    AFTER_DONE,
+    SNAPSHOT_PERIOD,
+    TEST_SEED_OFFSET,
+    ExpertInference,
+    LogRequest,
+)
+from iga_drake.tasks.registry import scenario_task
+from iga_drake.tasks.snapshots import Snapshot, read_snapshot
+from iga_drake.tasks.task import Split
+
+STATE_CHANNEL = "REHEARSAL_STATE"  # the simulated plant's positions, for the cameras alone
+_STATE_PERIOD = 1.0 / 30.0  # s
+_SLICE = 0.01  # s between two looks at what the cell is asked for
+_START_LIMIT = 300.0  # s (wall clock) for the cell's processes to be built
+_ANSWER_LIMIT = 60.0  # s (wall clock)
+_NICENESS = 10  # of the cameras: the arm comes first
+
+
+class RehearsalError(IgaDrakeError):
+    """The rehearsed cell can't be built, or one of its processes has ended."""
+
+
+@dataclass(frozen=True)
+class RehearsalClock:
+    """A clock (s since 1970) that runs at `rate` from `epoch` on."""
+
+    epoch: float
+    rate: float
+
+    def now(self) -> float:
+        """What it shows."""
+        return self.epoch + self.rate * (wall.time() - self.epoch)
+
+    def __call__(self, context: Context) -> float:
+        """What it shows, as the systems of a diagram ask for it."""
+        return self.now()
+
+
+@dataclass(frozen=True)
+class CellRequest:
+    """What the cell's processes are built from."""
+
+    scenario: str  # YAML
+    seed: int
+    split: Split
+    url: str
+    clock: RehearsalClock
+
+    def read(self) -> Scenario:
+        """The scenario, for the simulated station."""
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "scenario.yaml"
+            file.write_text(self.scenario, encoding="utf-8")
+            scenario = load_scenario(file)
+        buses = {"default": DrakeLcmParams(lcm_url=LcmBuses.kLcmUrlMemqNull)}
+        driver = replace(scenario.model_drivers["panda"], lcm_bus="default")
+        return replace(
+            scenario,
+            lcm_buses=buses,
+            model_drivers={"panda": driver},
+            hardware=replace(scenario.hardware, camera_bus="default"),
+        )
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How commands reached the arm, in milliseconds of the wall clock: median, 99 %, most."""
+
+    count: int
+    # Difference of the time between two commands from the control period.
+    jitter: tuple[float, float, float]
+    # From a command's stamp to its arrival.
+    latency: tuple[float, float, float]
+
+    def __str__(self) -> str:
+        def words(values: tuple[float, float, float]) -> str:
+            return " / ".join(f"{value:.2f}" for value in values)
+
+        return (
+            f"{self.count} commands; median / 99 % / most: jitter {words(self.jitter)} ms, "
+            f"latency {words(self.latency)} ms"
+        )
+
+
+def timing_of(arrivals: np.ndarray, stamps: np.ndarray, *, clock: RehearsalClock,
+              period: float) -> Timing:  # fmt: skip
+    """The timing of commands that arrived at `arrivals` (K,) and were stamped `stamps` (K,), both
+    s on the clock; gaps of ten periods and more are pauses in which nothing is commanded."""
+    if len(arrivals) < 2:
+        return Timing(len(arrivals), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    gaps = np.diff(stamps)
+    steady = np.diff(arrivals)[gaps < 10 * period] - period
+    steady = steady if len(steady) else np.zeros(1)
+    scale = 1000.0 / clock.rate
+    return Timing(
+        len(arrivals), _quantiles(scale * np.abs(steady)), _quantiles(scale * (arrivals - stamps))
+    )
+
+
+def _quantiles(values: np.ndarray) -> tuple[float, float, float]:
+    median, most_of_all, most = np.quantile(values, [0.5, 0.99, 1.0])
+    return float(median), float(most_of_all), float(most)
+
+
+# The cell's processes
+
+
+def _scene_of(request: CellRequest, scenario: Scenario) -> Any:
+    seed = request.seed + scenario.seeds.scene
+    task = scenario_task(scenario)
+    return with_distractors(task.scene(seed, request.split), scenario.distractors, seed)
+
+
+def _cell(request: CellRequest, scenario: Scenario, scene: Any) -> Any:
+    draws = request.seed + (TEST_SEED_OFFSET if request.split == "test" else 0)
+    cell = build_simulation_station(scenario, scene=scene, seed=draws)
+    cell.set_name("simulated")
+    return cell
+
+
+def run_arm(connection: Connection, request: CellRequest) -> None:
+    """The process of the arm: physics and the arm's server, until the pipe is closed.
+
+    It answers through the pipe: "expert" with the expert's present poses, "state" with the present
+    snapshot, "snapshots" with all.
+    """
+    _begin_process()
+    with _told(connection):
+        scenario = request.read()
+        scene, task = _scene_of(request, scenario), scenario_task(scenario)
+        driver = scenario.model_drivers["panda"]
+        lcm, clock = DrakeLcm(request.url), request.clock
+        builder = DiagramBuilder()
+        cell = builder.AddSystem(_cell(request, scenario, scene))
+        builder.AddSystem(LcmInterfaceSystem(lcm))
+        server = PandaServer(
+            lcm,
+            control_mode=cast(ControlMode, driver.control_mode),
+            expiry=driver.expiry,
+            opening=0.0 if scene.truth.X_EO else scene.hand_opening,
+            clock=clock,
+        )
+        add_panda_server(builder, server, lcm)
+        ports = {
+            port.get_name(): port
+            for port in (
+                *(cell.get_input_port(i) for i in range(cell.num_input_ports())),
+                *(cell.get_output_port(i) for i in range(cell.num_output_ports())),
+            )
+        }
+        connect_server(builder, server, ports)
+        simulator = Simulator(builder.Build())
+        simulator.set_target_realtime_rate(clock.rate)
+        simulator.Initialize()
+        plant = cell.GetSubsystemByName("plant")
+        context = plant.GetMyContextFromRoot(simulator.get_context())
+        panda = find_panda(plant)
+
+        def snapshot() -> Snapshot:
+            return read_snapshot(plant, context, panda)
+
+        sender = DrakeLcm(request.url)
+        snapshots, published = [snapshot()], -np.inf
+        connection.send(("ready", None))
+        simulator.ResetStatistics()
+        while True:
+            now = simulator.get_context().get_time()
+            simulator.AdvanceTo(now + _SLICE)
+            now = simulator.get_context().get_time()
+            if now >= SNAPSHOT_PERIOD * len(snapshots) - 1e-9:
+                snapshots.append(snapshot())
+            if now - published >= _STATE_PERIOD:
+                published = now
+                _publish_state(sender, plant.GetPositions(context), clock.now())
+            while connection.poll():
+                asked = connection.recv()
+                if asked == "expert":
+                    seen = snapshot()
+                    poses = task.expert(scene, seen.X_WO, seen.X_WE)
+                    connection.send(("ready", [X.GetAsMatrix4() for X in poses]))
+                elif asked == "state":
+                    connection.send(("ready", snapshot()))
+                else:
+                    connection.send(("ready", snapshots))
+
+
+def _publish_state(lcm: DrakeLcm, q: np.ndarray, now: float) -> None:
+    message = lcmt_drake_signal()
+    message.dim, message.val = len(q), [float(value) for value in q]
+    message.coord = [""] * len(q)
+    message.timestamp = utime_of(now)
+    lcm.Publish(STATE_CHANNEL, message.encode())
+
+
+def run_cameras(connection: Connection, request: CellRequest, period: float) -> None:
+    """The process of the cameras: each sends its images every `period` (s) at most, of the last
+    state that the arm's process has told, until the pipe is closed."""
+    _begin_process(niceness=_NICENESS)
+    with _told(connection):
+        scenario = request.read()
+        cell = _cell(request, scenario, _scene_of(request, scenario))
+        context = cell.CreateDefaultContext()
+        plant = cell.GetSubsystemByName("plant")
+        plant_context = plant.GetMyMutableContextFromRoot(context)
+        poses = {
+            name: cell.GetOutputPort(f"{name}.pose").Eval(context).GetAsMatrix4()
+            for name in scenario.cameras
+        }
+        kinds = ("color", "depth", "label")
+        for name in scenario.cameras:  # the first image of each takes seconds
+            for kind in kinds:
+                cell.GetOutputPort(f"{name}.{kind}_image").Eval(context)
+        connection.send(("ready", poses))
+        lcm, last = DrakeLcm(request.url), lcmt_drake_signal()
+        states: list[lcmt_drake_signal] = []
+
+        def receive(data: bytes) -> None:
+            message = decoded(lcmt_drake_signal, data)
+            if message is not None:
+                states[:] = [message]
+
+        lcm.Subscribe(STATE_CHANNEL, receive)
+        clock, due = request.clock, dict.fromkeys(scenario.cameras, 0.0)
+        begin = clock.now()
+        while not connection.poll():
+            for name in scenario.cameras:
+                lcm.HandleSubscriptions(20)
+                while lcm.HandleSubscriptions(0):
+                    pass
+                if not states or clock.now() < due[name]:
+                    continue
+                last = states[0]
+                due[name] = clock.now() + period
+                context.SetTime(max(1e-6 * last.timestamp - begin, 0.0))
+                plant.SetPositions(plant_context, np.array(last.val))
+                images = {
+                    kind: cell.GetOutputPort(f"{name}.{kind}_image").Eval(context).data
+                    for kind in kinds
+                }
+                message = encode_images(images, utime=last.timestamp)
+                lcm.Publish(f"{CHANNEL}{name}", message.encode())
+
+
+def run_monitor(connection: Connection, url: str, clock: RehearsalClock) -> None:
+    """The process that notes when commands arrive and what they are stamped with (s on the clock),
+    and tells it when it is asked."""
+    _begin_process()
+    with _told(connection):
+        lcm = DrakeLcm(url)
+        noted: list[tuple[float, float]] = []
+
+        def receive(data: bytes) -> None:
+            now = clock.now()
+            message = decoded(lcmt_panda_command, data)
+            if message is not None:
+                noted.append((now, 1e-6 * message.utime))
+
+        lcm.Subscribe(messages.COMMAND_CHANNEL, receive)
+        connection.send(("ready", None))
+        while True:
+            lcm.HandleSubscriptions(20)
+            if connection.poll():
+                connection.recv()
+                connection.send(("ready", np.array(noted).reshape(-1, 2)))
+
+
+def _begin_process(niceness: int = 0) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who rehearses is interrupted, and ends these
+    with contextlib.suppress(OSError):
+        os.nice(niceness)
+
+
+@contextlib.contextmanager
+def _told(connection: Connection) -> Iterator[None]:
+    """Ends quietly where nobody listens any more, and tells of any other error."""
+    try:
+        yield
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        return
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            connection.send(("failed", error_text(error)))
+
+
+# The side of the arm's program
+
+
+class RehearsedCell:
+    """The cell's processes, and what may be asked of them. Use it as a context manager."""
+
+    def __init__(self, request: CellRequest, *, image_period: float) -> None:
+        """Starts the processes and waits until all are built. Raises `RehearsalError`."""
+        context = multiprocessing.get_context("spawn")
+        self._processes: dict[str, BaseProcess] = {}
+        self._connections: dict[str, Connection] = {}
+        for name, target, arguments in (
+            ("arm", run_arm, (request,)),
+            ("cameras", run_cameras, (request, image_period)),
+            ("monitor", run_monitor, (request.url, request.clock)),
+        ):
+            mine, theirs = context.Pipe()
+            process = context.Process(
+                target=target, args=(theirs, *arguments), name=f"rehearsed {name}", daemon=True
+            )
+            process.start()
+            theirs.close()
+            self._processes[name], self._connections[name] = process, mine
+        try:
+            self._receive("arm", _START_LIMIT)
+            # Camera -> X_WC (4, 4) as a calibration would have found it, error included.
+            self.poses: Mapping[str, np.ndarray] = self._receive("cameras", _START_LIMIT)
+            self._receive("monitor", _START_LIMIT)
+        except BaseException:
+            self.close()
+            raise
+
+    def _receive(self, name: str, limit: float) -> Any:
+        connection = self._connections[name]
+        try:
+            if not connection.poll(limit):
+                raise RehearsalError(f"the rehearsed {name} doesn't answer within {limit:g} s")
+            kind, value = connection.recv()
+        except (EOFError, OSError) as error:
+            code = self._processes[name].exitcode
+            raise RehearsalError(
+                f"the process of the rehearsed {name} has ended ({code})"
+            ) from error
+        if kind == "failed":
+            raise RehearsalError(f"the rehearsed {name}: {value}")
+        return value
+
+    def ask(self, name: str, question: str) -> Any:
+        """The answer of one process. Raises `RehearsalError` where there is none."""
+        try:
+            self._connections[name].send(question)
+        except OSError as error:
+            raise RehearsalError(f"the process of the rehearsed {name} has ended") from error
+        return self._receive(name, _ANSWER_LIMIT)
+
+    def close(self) -> None:
+        """Ends the processes."""
+        for connection in self._connections.values():
+            connection.close()
+        for process in self._processes.values():
+            process.join(2.0)
+            if process.is_alive():
+                process.kill()
+                process.join()
+
+    def __enter__(self) -> "RehearsedCell":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+@dataclass(frozen=True)
+class RehearsalResult:
+    """The verdict on the true state, and how commands travelled."""
+
+    result: ArmResult
+    measures: Mapping[str, float]
+    timing: Timing
+    rate: float
+    # True poses (4, 4) of the scene's objects at the end.
+    X_WO: Mapping[str, np.ndarray]
+
+    def row(self) -> dict[str, Any]:
+        """The result as plain JSON values."""
+        return {
+            **self.result.row(),
+            "measures": {name: float(value) for name, value in self.measures.items()},
+            "rate": self.rate,
+            "commands": self.timing.count,
+            "jitter_ms": list(self.timing.jitter),
+            "latency_ms": list(self.timing.latency),
+            "X_WO": {name: X.tolist() for name, X in self.X_WO.items()},
+        }
+
+    def __str__(self) -> str:
+        return f"{self.result}\n  {self.timing} (rate {self.rate:g})"
+
+
+def rehearse(
+    scenario: Scenario,
+    *,
+    seed: int = 0,
+    split: Split = "test",
+    rate: float = 1.0,
+    image_period: float = 0.25,
+    record: LogRequest | None = None,
+    on_event: Callable[[str], None] | None = None,
+    proceed: Callable[[], bool] | None = None,
+) -> RehearsalResult:
+    """Runs one episode on a cell of processes, through LCM, at `rate`.
+
+    Boot checks, calibration files, hardware station, supervisor, policy and aligner are those of
+    the real arm. The aligner may be "expert". `on_event` and `proceed` are `ArmEpisode.run`'s.
+
+    Raises `RehearsalError`, and what `ArmEpisode` raises.
+    """
+    from pydrake.math import RigidTransform
+
+    task = scenario_task(scenario)
+    if scenario.aligner.name == ORACLE:
+        raise RehearsalError("the oracle knows the clouds' true shapes, not those behind LCM")
+    url = udp_url(20_000 + os.getpid() % 20_000)
+    check_receive_buffer(url)
+    clock = RehearsalClock(wall.time(), rate)
+    scenario = replace(scenario, lcm_buses={"default": DrakeLcmParams(lcm_url=url)})
+    driver = replace(scenario.model_drivers["panda"], lcm_bus="default")
+    request = CellRequest(scenario.to_yaml(), seed, split, url, clock)
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        cell = stack.enter_context(RehearsedCell(request, image_period=image_period))
+        for name, X in cell.poses.items():
+            X_WC = RigidTransform(X)
+            pose = Pose(
+                [float(v) for v in X_WC.translation()],
+                [float(v) for v in RollPitchYaw(X_WC.rotation()).vector()],
+            )
+            date = datetime.datetime.now(datetime.UTC).isoformat()
+            write_calibration(
+                folder / f"{name}.yaml",
+                CameraCalibration(date, pose, scenario.cameras[name].intrinsics),
+            )
+        scenario = replace(
+            scenario,
+            station="hardware",
+            model_drivers={"panda": driver},
+            hardware=replace(scenario.hardware, camera_bus="default", calibration=str(folder)),
+        )
+        start = boot_panda(
+            DrakeLcm(url), driver, limit=scenario.hardware.boot_limit / rate, clock=clock.now
+        )
+        inference: Inference | None = None
+        if scenario.aligner.name == EXPERT:
+            inference = ExpertInference(
+                lambda: tuple(RigidTransform(X) for X in cell.ask("arm", "expert"))
+            )
+        with ArmEpisode(
+            scenario,
+            seed=seed,
+            station=build_hardware_station(scenario, start=start, clock=clock),
+            inference=inference,
+            rate=rate,
+            record=record,
+        ) as episode:
+            result = episode.run(on_event, proceed=proceed, after_done=AFTER_DONE)
+            snapshots = cell.ask("arm", "snapshots")
+            scene = with_distractors(
+                task.scene(seed + scenario.seeds.scene, split),
+                scenario.distractors,
+                seed + scenario.seeds.scene,
+            )
+            measures: Mapping[str, float] = {}
+            if result.finished:
+                verdict = task.success(scene, snapshots)
+                measures = dict(verdict.measures)
+                cause = None if verdict.success else Cause.CONTACT
+                result = replace(
+                    result, success=verdict.success, reason=verdict.reason, cause=cause
+                )
+            episode.note(result)
+        noted = cell.ask("monitor", "commands")
+    period = scenario.control.period
+    return RehearsalResult(
+        result=result,
+        measures=measures,
+        timing=timing_of(noted[:, 0], noted[:, 1], clock=clock, period=period),
+        rate=rate,
+        X_WO={name: X.GetAsMatrix4() for name, X in snapshots[-1].X_WO.items()},
+    )

@@ -1,0 +1,52 @@
+"""The cell in processes of its own, behind LCM over UDP, commanded at the clock's pace."""
+
+import numpy as np
+import pytest
+
+from iga_drake import cli
+from iga_drake.policy.motion import Phase
+from iga_drake.station.cameras.rgbd import Intrinsics
+from iga_drake.station.scenario import load_scenario
+from iga_drake.tasks.rehearsal import RehearsalClock, rehearse, timing_of
+
+
+def test_a_cell_of_processes_is_booted_seen_and_commanded():
+    scenario = load_scenario(
+        "grasp", "hardware",
+        overrides=["segmentation.source=truth", "aligner.name=expert",
+                   "panda.visuals=primitives"],
+    )  # fmt: skip
+    for camera in scenario.cameras.values():
+        camera.intrinsics = Intrinsics(160, 120, fx=154.0, fy=154.0, cx=79.5, cy=59.5)
+    scenario.policy.minimum_points = 8
+    said: list[str] = []
+    moving: list[None] = []
+
+    def proceed() -> bool:
+        """Until it has moved for a while, however long the first image takes."""
+        if any("move grasp" in line for line in said):
+            moving.append(None)
+        return len(moving) < 10
+
+    rehearsed = rehearse(scenario, rate=0.1, on_event=said.append, proceed=proceed)
+    phases = [entry.phase for entry in rehearsed.result.timeline]
+    assert phases[:3] == [Phase.OBSERVE, Phase.INFER, Phase.MOVE], rehearsed.result
+    assert rehearsed.timing.count > 20
+    assert rehearsed.row()["rate"] == 0.1 and "FAILURE" in str(rehearsed)
+
+
+def test_timing_is_in_milliseconds_of_the_wall_clock():
+    clock = RehearsalClock(0.0, 0.5)
+    # Every 5 ms, one 2 ms late; then a pause, and two more.
+    stamps = np.array([0.0, 0.005, 0.010, 0.015, 1.0, 1.005])
+    arrivals = stamps + [0.001, 0.001, 0.003, 0.001, 0.001, 0.001]
+    timing = timing_of(arrivals, stamps, clock=clock, period=0.005)
+    assert timing.count == 6
+    assert timing.jitter[2] == pytest.approx(4.0)  # 2 ms of a clock at half the pace
+    assert timing.latency[0] == pytest.approx(2.0) and timing.latency[2] == pytest.approx(6.0)
+    assert timing_of(np.zeros(0), np.zeros(0), clock=clock, period=0.005).count == 0
+
+
+def test_a_rate_above_the_clocks_is_refused(capsys: pytest.CaptureFixture):
+    assert cli.main(["rehearse", "grasp", "--realtime", "2"]) == cli.BAD_INPUT
+    assert "0.01 to 1" in capsys.readouterr().err
