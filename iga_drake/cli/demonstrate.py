@@ -1,12 +1,12 @@
 """`iga demonstrate`: the scripted expert records demonstrations."""
 
 import argparse
-import sys
-from pathlib import Path
 
 from iga_drake.cli.options import seed
 from iga_drake.cli.scenarios import add_scenario_arguments, scenario_of
 from iga_drake.cli.status import SUCCESS, CommandError
+from iga_drake.errors import kept_on_interrupt
+from iga_drake.files import output_folder
 
 MOST = 10_000
 
@@ -15,7 +15,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga demonstrate`."""
     add_scenario_arguments(parser)
     parser.add_argument("--count", type=int, default=5, help="demonstrations to keep")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    parser.add_argument(
+        "--out", type=output_folder, required=True, metavar="DIR", help="a new folder"
+    )
     parser.add_argument(
         "--overwrite", action="store_true", help="replace the demonstrations that are in DIR"
     )
@@ -43,14 +45,12 @@ def run(arguments: argparse.Namespace) -> int:
         )
     key = {"scenario": scenario.digest, "seed": arguments.seed, "code": code_version()}
     recording = Recording(arguments.out, task=task, key=key)
-    try:
+    with kept_on_interrupt(
+        lambda: f"{recording.kept} demonstrations are kept, the same command goes on from there"
+    ):
         demonstrations = record_demonstrations(
             scenario, count=arguments.count, first_seed=arguments.seed, recording=recording
         )
-    except KeyboardInterrupt:
-        again = "the same command goes on from there"
-        print(f"{recording.kept} demonstrations are kept: {again}", file=sys.stderr)
-        raise
     write_demonstrations(arguments.out, demonstrations)
     recording.end()
     print(f"{len(demonstrations)} demonstrations of '{demonstrations.task}' in {arguments.out}")

@@ -7,6 +7,7 @@ or ranks ever make the same sample, their number changes nothing, and a run resu
 import dataclasses
 import itertools
 import multiprocessing
+import signal
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -96,7 +97,9 @@ def _processes() -> Any:
 
 
 def _start_worker(_: int) -> None:
-    """One thread a worker: the workers share the cores."""
+    """One thread a worker: the workers share the cores. Ctrl-C is the first process's matter, which
+    ends them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
 
 

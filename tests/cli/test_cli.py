@@ -14,6 +14,7 @@ from iga_drake.cli import shapes
 from iga_drake.cli.options import add_aligner_options, aligner_options
 from iga_drake.cli.status import CommandError
 from iga_drake.demonstrations.store import write_demonstrations
+from iga_drake.errors import kept_on_interrupt
 from iga_drake.paths import diagrams_dir
 from iga_drake.tasks.registry import make_task
 
@@ -102,9 +103,16 @@ def test_an_interrupt_ends_quietly(capsys, monkeypatch):
     def interrupted(arguments):
         raise KeyboardInterrupt
 
+    def interrupted_later(arguments):
+        with kept_on_interrupt(lambda: "two files are kept"):
+            raise KeyboardInterrupt
+
     monkeypatch.setattr(shapes, "run", interrupted)
     assert cli.main(["shapes", "list"]) == cli.INTERRUPTED == 130
     assert capsys.readouterr().err == "iga shapes: interrupted\n"
+    monkeypatch.setattr(shapes, "run", interrupted_later)
+    assert cli.main(["shapes", "list"]) == cli.INTERRUPTED
+    assert capsys.readouterr().err == "iga shapes: interrupted; two files are kept\n"
 
 
 def test_a_full_disk_is_no_bug(capsys, monkeypatch):

@@ -40,8 +40,10 @@ def write_settings(folder: Path, **training) -> Path:
     return path
 
 
-def command(*options: object, launcher: tuple[str, ...] = ()) -> subprocess.Popen:
-    """`iga train descriptor` in a process of its own."""
+def command(
+    *options: object, launcher: tuple[str, ...] = (), own_group: bool = False
+) -> subprocess.Popen:
+    """`iga train descriptor` in a process of its own; `own_group`: as a shell starts it."""
     start = (*launcher, "-m", "iga_drake.cli", "train", "descriptor", "--device", "cpu")
     return subprocess.Popen(
         [sys.executable, *start, *map(str, options)],
@@ -49,6 +51,7 @@ def command(*options: object, launcher: tuple[str, ...] = ()) -> subprocess.Pope
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
+        start_new_session=own_group,
     )
 
 

@@ -8,7 +8,8 @@ import pytest
 from browser import Browser, needs_browser
 from view_fixtures import END, ENERGIES, PROBABILITIES, shown_run
 
-from iga_drake.viewing.meshcat import RunButtons, wait_for_browser
+from iga_drake.viewing.meshcat import RunButtons, start_meshcat, wait_for_browser
+from iga_drake.viewing.policy_views import show_text
 from iga_drake.viewing.replay import replay_html
 
 pytestmark = needs_browser
@@ -22,7 +23,15 @@ FIND = """
 }
 """
 
-FIND_TEXT = "viewer.scene_tree.find(['Cameras', 'default', 'rotated', '<object>', 'text']).children"
+# The words of the texts that are loaded and seen.
+TEXT_NODES = (
+    "viewer.scene_tree.find(['Cameras', 'default', 'rotated', '<object>', 'text']).children"
+)
+TEXTS = f"""
+Object.values({TEXT_NODES})
+  .filter(text => text.object.visible)
+  .flatMap(text => Object.keys(text.children)).filter(name => name != '<object>')
+"""
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +77,8 @@ def test_live_page(browser, monkeypatch):
             if entry.phase.value == "infer"
         )
         browser.wait_for(has_shape(image))  # a textured plane, which loads by itself
-        assert "move grasp" in browser.evaluate(f"Object.keys({FIND_TEXT}).join()")
+        (text,) = browser.evaluate(TEXTS)
+        assert "move grasp" in text
         # It hangs before the camera; the chosen mode is shown as such alone.
         browser.wait_for("viewer.camera.children.length")
         first, second = (
@@ -104,6 +114,23 @@ def test_live_page(browser, monkeypatch):
         assert buttons.restarts and not buttons.proceed()
     finally:
         buttons.remove()
+    assert browser.errors == []
+
+
+def test_of_texts_that_follow_each_other_quickly_the_last_is_seen(browser):
+    meshcat = start_meshcat()
+    browser.open(meshcat.web_url())
+    assert wait_for_browser(meshcat, 60.0)
+    for words in ("one", "two", "three"):
+        show_text(meshcat, [words])
+    loaded = f"Object.keys({TEXT_NODES}).length == 3 && " + " && ".join(
+        f"{TEXT_NODES}[{number}].children.{words}.children['<object>']"
+        for number, words in enumerate(("one", "two", "three"))
+    )
+    browser.wait_for(loaded)
+    assert browser.evaluate(TEXTS) == ["three"]
+    show_text(meshcat, [])
+    browser.wait_for(f"({TEXTS}).length == 0")
     assert browser.errors == []
 
 
