@@ -1,4 +1,10 @@
-"""Headless Chromium for tests of pages, driven by the DevTools protocol over a pipe."""
+"""Headless Chromium for tests of pages, driven by the DevTools protocol over a pipe.
+
+    .venv/bin/python tests/browser.py REPLAY.html
+
+prints the size of a replay, and how long it takes from asking for it until its first picture: one
+in which the robot is drawn, at the beginning of the recording.
+"""
 
 import base64
 import json
@@ -6,11 +12,14 @@ import os
 import select
 import shutil
 import subprocess
+import sys
+import tempfile
 import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import psutil
 import pytest
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
@@ -139,3 +148,55 @@ class Browser:
         """Writes what is seen as a picture; `options` of `Page.captureScreenshot`."""
         data = self.command("Page.captureScreenshot", **options)["data"]
         path.write_bytes(base64.b64decode(data))
+
+    def cpu_seconds(self) -> float:
+        """Processor time of all of the browser's processes until now."""
+        total = 0.0
+        for process in [root := psutil.Process(self._process.pid), *root.children(recursive=True)]:
+            try:
+                times = process.cpu_times()
+            except psutil.NoSuchProcess:
+                continue
+            total += times.user + times.system
+        return total
+
+
+def is_drawn(path: list[str]) -> str:
+    """Script: whether something is drawn below a path of Meshcat's tree."""
+    return (
+        "(() => { let found = false;"
+        f" viewer.scene_tree.find({path}).object.traverse(o => {{ found = found || o.geometry; }});"
+        " return found; })()"
+    )
+
+
+ROBOT = ["drake", "illustration", "panda", "panda_link7"]
+
+
+def open_replay(browser: Browser, page: Path, picture: Path, *, at: float | None = None) -> None:
+    """Opens a replay, which begins to play, or stands still `at` so many seconds, and takes its
+    first picture in which the robot is drawn."""
+    browser.open(page.resolve().as_uri() + (f"#t={at}" if at is not None else ""))
+    browser.wait_for("typeof iga == 'object' && iga.ready()", 120.0)
+    browser.wait_for(is_drawn(ROBOT), 120.0)
+    browser.picture(picture)
+
+
+def main(page: Path) -> None:
+    """Prints the size of a replay and the time to its first picture, the median of five."""
+    walls, cpus = [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(5):
+            with Browser(Path(folder) / str(number)) as browser:
+                cpu, begin = browser.cpu_seconds(), time.monotonic()
+                open_replay(browser, page, Path(folder) / "picture.png")
+                walls.append(time.monotonic() - begin)
+                cpus.append(browser.cpu_seconds() - cpu)
+    print(
+        f"{page}: {page.stat().st_size / 1e6:.1f} MB, first picture after {sorted(walls)[2]:.1f} s "
+        f"({min(walls):.1f} to {max(walls):.1f}), {sorted(cpus)[2]:.1f} s of a processor's time"
+    )
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
