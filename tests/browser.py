@@ -89,7 +89,7 @@ class Browser:
         os.close(self._read)
         os.close(self._write)
 
-    def command(self, method: str, timeout: float = 120.0, **parameters: Any) -> dict[str, Any]:
+    def command(self, method: str, timeout: float = 300.0, **parameters: Any) -> dict[str, Any]:
         """Sends a command and returns its result; events that come before it are noted."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
@@ -132,7 +132,7 @@ class Browser:
         assert "exceptionDetails" not in done, done["exceptionDetails"]
         return done["result"].get("value")
 
-    def wait_for(self, script: str, timeout: float = 60.0) -> None:
+    def wait_for(self, script: str, timeout: float = 300.0) -> None:
         """Waits until an expression has a value that counts as true."""
         end = time.monotonic() + timeout
         while not self.evaluate(f"Boolean({script})"):
@@ -170,6 +170,16 @@ def is_drawn(path: list[str]) -> str:
     )
 
 
+def click(browser: Browser, button: str) -> None:
+    """Clicks a button of Meshcat's controls."""
+    script = (
+        "(() => { const [line] = [...document.querySelectorAll('.dg li.function')]"
+        f".filter(e => e.innerText.trim() == {json.dumps(button)});"
+        " line.click(); return true; })()"
+    )
+    assert browser.evaluate(script)
+
+
 ROBOT = ["drake", "illustration", "panda", "panda_link7"]
 
 
@@ -177,8 +187,8 @@ def open_replay(browser: Browser, page: Path, picture: Path, *, at: float | None
     """Opens a replay, which begins to play, or stands still `at` so many seconds, and takes its
     first picture in which the robot is drawn."""
     browser.open(page.resolve().as_uri() + (f"#t={at}" if at is not None else ""))
-    browser.wait_for("typeof iga == 'object' && iga.ready()", 120.0)
-    browser.wait_for(is_drawn(ROBOT), 120.0)
+    browser.wait_for("typeof iga == 'object' && iga.ready()")
+    browser.wait_for(is_drawn(ROBOT))
     browser.picture(picture)
 
 

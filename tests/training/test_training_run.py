@@ -173,9 +173,9 @@ def test_ctrl_c_ends_a_training_with_one_line_that_says_what_is_kept(tmp_path: P
     said, _ = process.communicate(timeout=120)
     assert process.returncode == cli.INTERRUPTED, said
     told = [line for line in said.splitlines() if not line.startswith("step ")]
-    (line,) = told
-    found = re.match(r"iga train: interrupted; step (\d+) is kept in \S+/run, the same", line)
-    assert found and int(found[1]) == state(tmp_path / "run")[1]["step"] >= 1, line
+    assert len(told) == 1, said
+    found = re.match(r"iga train: interrupted; step (\d+) is kept in \S+/run, the same", told[0])
+    assert found and int(found[1]) == state(tmp_path / "run")[1]["step"] >= 1, said
 
 
 def test_a_run_killed_at_any_moment_ends_as_if_it_had_not_been(tmp_path: Path) -> None:

@@ -37,12 +37,12 @@ def test_an_episode_is_looked_at_live_and_as_a_replay(tmp_path: Path):
         assert status.phase is Phase.MOVE, status.reason
         with Browser(tmp_path / "live", width=1280, height=720) as browser:
             browser.open(meshcat.web_url())
-            browser.wait_for("typeof viewer == 'object' && viewer.scene_tree.children.drake", 120.0)
+            browser.wait_for("typeof viewer == 'object' && viewer.scene_tree.children.drake")
             seen = max(observation.time for observation in episode.memory.observations.values())
             image = ["drake", "cameras", "camera_0", f"image at {seen:.2f} s"]
             text = ["Cameras", "default", "rotated", "<object>", "text"]
             for path in (image, text, ROBOT):
-                browser.wait_for(is_drawn(path), 120.0)
+                browser.wait_for(is_drawn(path))
             browser.picture(pictures / "live.jpg", **JPEG)
             assert browser.errors == []
         result = episode.run()
