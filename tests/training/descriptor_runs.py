@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -43,7 +44,8 @@ def write_settings(folder: Path, **training) -> Path:
 def command(
     *options: object, launcher: tuple[str, ...] = (), own_group: bool = False
 ) -> subprocess.Popen:
-    """`iga train descriptor` in a process of its own; `own_group`: as a shell starts it."""
+    """`iga train descriptor` in a process of its own; `own_group`: as a terminal's shell starts it,
+    in a group of processes that doesn't ignore Ctrl-C."""
     start = (*launcher, "-m", "iga_drake.cli", "train", "descriptor", "--device", "cpu")
     return subprocess.Popen(
         [sys.executable, *start, *map(str, options)],
@@ -52,7 +54,12 @@ def command(
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=own_group,
+        preexec_fn=_heed_interrupts if own_group else None,
     )
+
+
+def _heed_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # what runs in the background may ignore it
 
 
 def state(folder: Path) -> tuple[dict[str, torch.Tensor], dict]:

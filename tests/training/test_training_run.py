@@ -170,7 +170,10 @@ def test_ctrl_c_ends_a_training_with_one_line_that_says_what_is_kept(tmp_path: P
     while process.poll() is None and not (tmp_path / "run" / "state.safetensors").is_file():
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGINT)
-    said, _ = process.communicate(timeout=120)
+    try:
+        said, _ = process.communicate(timeout=300)
+    finally:
+        process.kill()
     assert process.returncode == cli.INTERRUPTED, said
     told = [line for line in said.splitlines() if not line.startswith("step ")]
     assert len(told) == 1, said
