@@ -126,6 +126,7 @@ def test_of_texts_that_follow_each_other_quickly_the_last_is_seen(browser):
     assert browser.evaluate(TEXTS) == ["three"]
     show_text(meshcat, [])
     browser.wait_for(f"({TEXTS}).length == 0")
+    browser.open("about:blank")  # before the server ends
     assert browser.errors == []
 
 
