@@ -94,10 +94,11 @@ def notice(build: Build | None, extras: list[str]) -> str:
     parts += [(f"extra '{name}'", EXTRA_SIZES[name]) for name in extras if name in EXTRA_SIZES]
     fetched, disk = (sum(size[k] for _, size in parts) for k in (0, 1))
     lines = [f"  {name:48} {a:>5} MB {b:>5} MB" for name, (a, b) in parts]
+    what = "about" if build is not None else "at most, since a part of it is there"
     free = shutil.disk_usage(sys.prefix).free / 1e6
     return "\n".join(
         [
-            f"Into {sys.prefix}, about:",
+            f"Into {sys.prefix}, {what}:",
             f"  {'':48} fetched  on disk",
             *lines,
             f"  {'together':48} {fetched:>5} MB {disk:>5} MB   ({free:.0f} MB are free)",

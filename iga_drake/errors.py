@@ -1,7 +1,8 @@
 """The base of every error that this package raises on purpose."""
 
+import contextlib
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 TEXT_LIMIT = 2000  # characters of an error in one line
@@ -24,6 +25,17 @@ def error_text(error: BaseException) -> str:
     if isinstance(error, IgaDrakeError) and text:
         return text
     return f"{kind}: {text}" if text else kind
+
+
+@contextlib.contextmanager
+def kept_on_interrupt(kept: Callable[[], str]) -> Iterator[None]:
+    """Adds to a `KeyboardInterrupt` of the block, as a note, what is kept of the work: `kept()`,
+    which is asked only then. The command line tells it."""
+    try:
+        yield
+    except KeyboardInterrupt as interrupt:
+        interrupt.add_note(kept())
+        raise
 
 
 def shortened(value: object) -> str:

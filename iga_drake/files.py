@@ -110,6 +110,22 @@ def check_output(path: Path | str | None, *, begins: tuple[bytes, ...] | None = 
         raise OutputError(f"{shortened(str(path))}: can't be written ({error})") from error
 
 
+def output_file(text: str, *, suffix: str = "", begins: tuple[bytes, ...] | None = None) -> Path:
+    """The path of a file to be written, as argparse takes it: checked by `check_output` before any
+    work is done. `suffix`: what its name has to end in."""
+    check_output(text, begins=begins)
+    if not text.lower().endswith(suffix):
+        raise OutputError(f"{shortened(text)}: name a file that ends in {suffix}")
+    return Path(text)
+
+
+def output_folder(text: str) -> Path:
+    """The path of a folder to write into, as argparse takes it: checked by `check_output_folder`
+    before any work is done."""
+    check_output_folder(text)
+    return Path(text)
+
+
 def check_output_folder(path: Path | str | None) -> None:
     """Raises `OutputError` unless files can be written into the folder `path`, there or to be made.
     None is no output."""

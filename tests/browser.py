@@ -1,4 +1,10 @@
-"""Headless Chromium for tests of pages, driven by the DevTools protocol over a pipe."""
+"""Headless Chromium for tests of pages, driven by the DevTools protocol over a pipe.
+
+    .venv/bin/python tests/browser.py REPLAY.html
+
+prints the size of a replay, and how long it takes from asking for it until its first picture: one
+in which the robot is drawn, at the beginning of the recording.
+"""
 
 import base64
 import json
@@ -6,11 +12,14 @@ import os
 import select
 import shutil
 import subprocess
+import sys
+import tempfile
 import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import psutil
 import pytest
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
@@ -80,7 +89,7 @@ class Browser:
         os.close(self._read)
         os.close(self._write)
 
-    def command(self, method: str, timeout: float = 120.0, **parameters: Any) -> dict[str, Any]:
+    def command(self, method: str, timeout: float = 300.0, **parameters: Any) -> dict[str, Any]:
         """Sends a command and returns its result; events that come before it are noted."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
@@ -123,7 +132,7 @@ class Browser:
         assert "exceptionDetails" not in done, done["exceptionDetails"]
         return done["result"].get("value")
 
-    def wait_for(self, script: str, timeout: float = 60.0) -> None:
+    def wait_for(self, script: str, timeout: float = 300.0) -> None:
         """Waits until an expression has a value that counts as true."""
         end = time.monotonic() + timeout
         while not self.evaluate(f"Boolean({script})"):
@@ -139,3 +148,65 @@ class Browser:
         """Writes what is seen as a picture; `options` of `Page.captureScreenshot`."""
         data = self.command("Page.captureScreenshot", **options)["data"]
         path.write_bytes(base64.b64decode(data))
+
+    def cpu_seconds(self) -> float:
+        """Processor time of all of the browser's processes until now."""
+        total = 0.0
+        for process in [root := psutil.Process(self._process.pid), *root.children(recursive=True)]:
+            try:
+                times = process.cpu_times()
+            except psutil.NoSuchProcess:
+                continue
+            total += times.user + times.system
+        return total
+
+
+def is_drawn(path: list[str]) -> str:
+    """Script: whether something is drawn below a path of Meshcat's tree."""
+    return (
+        "(() => { let found = false;"
+        f" viewer.scene_tree.find({path}).object.traverse(o => {{ found = found || o.geometry; }});"
+        " return found; })()"
+    )
+
+
+def click(browser: Browser, button: str) -> None:
+    """Clicks a button of Meshcat's controls."""
+    script = (
+        "(() => { const [line] = [...document.querySelectorAll('.dg li.function')]"
+        f".filter(e => e.innerText.trim() == {json.dumps(button)});"
+        " line.click(); return true; })()"
+    )
+    assert browser.evaluate(script)
+
+
+ROBOT = ["drake", "illustration", "panda", "panda_link7"]
+
+
+def open_replay(browser: Browser, page: Path, picture: Path, *, at: float | None = None) -> None:
+    """Opens a replay, which begins to play, or stands still `at` so many seconds, and takes its
+    first picture in which the robot is drawn."""
+    browser.open(page.resolve().as_uri() + (f"#t={at}" if at is not None else ""))
+    browser.wait_for("typeof iga == 'object' && iga.ready()")
+    browser.wait_for(is_drawn(ROBOT))
+    browser.picture(picture)
+
+
+def main(page: Path) -> None:
+    """Prints the size of a replay and the time to its first picture, the median of five."""
+    walls, cpus = [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(5):
+            with Browser(Path(folder) / str(number)) as browser:
+                cpu, begin = browser.cpu_seconds(), time.monotonic()
+                open_replay(browser, page, Path(folder) / "picture.png")
+                walls.append(time.monotonic() - begin)
+                cpus.append(browser.cpu_seconds() - cpu)
+    print(
+        f"{page}: {page.stat().st_size / 1e6:.1f} MB, first picture after {sorted(walls)[2]:.1f} s "
+        f"({min(walls):.1f} to {max(walls):.1f}), {sorted(cpus)[2]:.1f} s of a processor's time"
+    )
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

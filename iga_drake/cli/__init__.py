@@ -88,8 +88,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _internal(command, error)
         print(f"iga {command}: {missing_extra(error)}", file=sys.stderr)
         return BAD_INPUT
-    except KeyboardInterrupt:
-        print(f"iga {command}: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        if sys.stderr.isatty():  # ends the line of a progress bar, and the terminal's "^C"
+            print(file=sys.stderr)
+        told = "; ".join(["interrupted", *getattr(interrupt, "__notes__", ())])
+        print(f"iga {command}: {told}", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         with contextlib.suppress(OSError):  # nobody reads: no word of it when Python ends

@@ -1,11 +1,12 @@
 """`iga dataset`: writes the samples of a set to files, and prints digests of sets."""
 
 import argparse
-from pathlib import Path
 
 from tqdm import tqdm
 
 from iga_drake.cli.status import CommandError
+from iga_drake.errors import kept_on_interrupt
+from iga_drake.files import output_folder
 from iga_drake.progress import counter
 
 
@@ -14,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     kinds = parser.add_subparsers(dest="kind", required=True)
     export = kinds.add_parser("export", help="write samples as safetensors shards; resumes")
     _add_set(export)
-    export.add_argument("--out", type=Path, required=True, metavar="DIR")
+    export.add_argument("--out", type=output_folder, required=True, metavar="DIR")
     export.add_argument("--shard-size", type=int, default=256, help="samples a file (default 256)")
     export.add_argument("--jobs", type=int, default=1, help="processes; -1: all cores (default 1)")
     export.add_argument(
@@ -66,17 +67,19 @@ def _export(arguments: argparse.Namespace) -> int:
             shown.append(counter("shards", total, done=done))
         shown[0].update(done - shown[0].n)
 
-    result = export_shards(
-        arguments.split,
-        count,
-        arguments.out,
-        config=SampleConfig(meshes=arguments.meshes),
-        shard_size=arguments.shard_size,
-        jobs=arguments.jobs,
-        backend="loky" if arguments.ray is None else "ray",
-        address=arguments.ray or None,
-        progress=show,
-    )
+    kept = f"finished shards are kept in {arguments.out}, the same command goes on from there"
+    with kept_on_interrupt(lambda: kept):
+        result = export_shards(
+            arguments.split,
+            count,
+            arguments.out,
+            config=SampleConfig(meshes=arguments.meshes),
+            shard_size=arguments.shard_size,
+            jobs=arguments.jobs,
+            backend="loky" if arguments.ray is None else "ray",
+            address=arguments.ray or None,
+            progress=show,
+        )
     shown[0].close()
     print(
         f"{result.manifest}: {count} samples of '{arguments.split}', {result.made} shards made, "

@@ -4,16 +4,16 @@ import argparse
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from iga_drake.cli.options import seed
 from iga_drake.cli.scenarios import add_scenario_arguments, scenario_of
 from iga_drake.cli.status import SUCCESS, CommandError
+from iga_drake.errors import kept_on_interrupt
+from iga_drake.files import output_folder
 
 if TYPE_CHECKING:
     from iga_drake.demonstrations.demonstration import Demonstration
@@ -27,7 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga demonstrate`."""
     add_scenario_arguments(parser)
     parser.add_argument("--count", type=int, default=5, help="demonstrations to keep")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    parser.add_argument(
+        "--out", type=output_folder, required=True, metavar="DIR", help="a new folder"
+    )
     parser.add_argument(
         "--overwrite", action="store_true", help="replace the demonstrations that are in DIR"
     )
@@ -73,17 +75,16 @@ def run(arguments: argparse.Namespace) -> int:
         return recording.get(seed)
 
     try:
-        demonstrations = record_demonstrations(
-            scenario,
-            count=arguments.count,
-            first_seed=arguments.seed,
-            recording=recording,
-            attempt=attempt,
-        )
-    except KeyboardInterrupt:
-        again = "the same command goes on from there"
-        print(f"{recording.kept} demonstrations are kept: {again}", file=sys.stderr)
-        raise
+        with kept_on_interrupt(
+            lambda: f"{recording.kept} demonstrations are kept, the same command goes on from there"
+        ):
+            demonstrations = record_demonstrations(
+                scenario,
+                count=arguments.count,
+                first_seed=arguments.seed,
+                recording=recording,
+                attempt=attempt,
+            )
     finally:
         for process in multiprocessing.active_children():
             process.kill()

@@ -3,11 +3,14 @@
 import argparse
 import json
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 from iga_drake.aligners.registry import ORACLE, make_aligner
 from iga_drake.cli.options import add_aligner_options, aligner_options, names
-from iga_drake.files import check_output, write_text
+from iga_drake.errors import kept_on_interrupt
+from iga_drake.evaluation.results import ResultsStore, results_file, results_kept
+from iga_drake.files import output_file, write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,7 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--sets", type=names, help="of samples (default: the paper's five, cross_instance)"
     )
     parser.add_argument("--count", type=int, default=100, help="samples of each set")
-    parser.add_argument("--results", type=Path, help="results file to append to and go on from")
+    parser.add_argument(
+        "--results", type=results_file, help="results file to append to and go on from"
+    )
     parser.add_argument(
         "--up", action=argparse.BooleanOptionalAction,
         help="give the aligners the objects' ways up (default: in sets of relations alone)",
@@ -32,8 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--by-category", action="store_true", help="also by kind of object")
     parser.add_argument("--weights", help="short for --option weights=FILE")
     parser.add_argument("--energy", help="short for --option energy=FILE")
-    parser.add_argument("--card", type=Path, help="write a model card of iga's weights")
-    parser.add_argument("--energy-card", type=Path, help="write one of its energy")
+    card = partial(output_file, begins=(b"#",))
+    parser.add_argument("--card", type=card, help="write a model card of iga's weights")
+    parser.add_argument("--energy-card", type=card, help="write one of its energy")
     parser.add_argument("--json", action="store_true", help="print the errors as JSON")
 
 
@@ -45,10 +51,7 @@ def run(arguments: argparse.Namespace) -> None:
         by_category,
         evaluate_alignment,
     )
-    from iga_drake.evaluation.results import ResultsStore
 
-    for card in (arguments.card, arguments.energy_card):
-        check_output(card, begins=(b"#",))
     short = {name: getattr(arguments, name) for name in ("weights", "energy")}
     given = {name: path for name, path in short.items() if path is not None}
     asked = [name for name in arguments.aligner if name != ORACLE]
@@ -58,31 +61,32 @@ def run(arguments: argparse.Namespace) -> None:
     summaries = []
     if not arguments.json:
         print(HEADER)
-    for name in arguments.aligner:
-        rows = []
-        kinds = arguments.field if name != ORACLE else []  # it knows which points are whose
-        for chosen in arguments.sets or EVALUATION_SETS:
-            clean = None
-            for field in ("", *kinds):
-                summary, found = evaluate_alignment(
-                    aligners.get(name),
-                    chosen,
-                    arguments.count,
-                    up=arguments.up,
-                    field=field,
-                    options=options.get(name),
-                    store=store,
-                )
-                clean = clean or summary
-                summaries.append(summary)
-                rows += [] if field else found
-                if arguments.json:
-                    continue
-                print(summary.rows(), flush=True)
-                if field:
-                    print(f"{'':<41}{summary.ratio(clean):.2f} of the clean share in 2 cm 10°")
-        if arguments.by_category and not arguments.json:
-            print(by_category(rows))
+    with kept_on_interrupt(lambda: results_kept(arguments.results)):
+        for name in arguments.aligner:
+            rows = []
+            kinds = arguments.field if name != ORACLE else []  # it knows which points are whose
+            for chosen in arguments.sets or EVALUATION_SETS:
+                clean = None
+                for field in ("", *kinds):
+                    summary, found = evaluate_alignment(
+                        aligners.get(name),
+                        chosen,
+                        arguments.count,
+                        up=arguments.up,
+                        field=field,
+                        options=options.get(name),
+                        store=store,
+                    )
+                    clean = clean or summary
+                    summaries.append(summary)
+                    rows += [] if field else found
+                    if arguments.json:
+                        continue
+                    print(summary.rows(), flush=True)
+                    if field:
+                        print(f"{'':<41}{summary.ratio(clean):.2f} of the clean share in 2 cm 10°")
+            if arguments.by_category and not arguments.json:
+                print(by_category(rows))
     if arguments.json:
         print(json.dumps([asdict(summary) for summary in summaries], indent=2))
     _write_cards(arguments, summaries)

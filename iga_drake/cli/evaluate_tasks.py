@@ -5,6 +5,7 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,9 @@ from iga_drake.cli.scenarios import (
     with_aligner,
 )
 from iga_drake.cli.status import FAILURE, INTERNAL, SUCCESS, CommandError
-from iga_drake.files import check_output, write_text
+from iga_drake.errors import kept_on_interrupt
+from iga_drake.evaluation.results import ResultsStore, results_file, results_kept
+from iga_drake.files import output_file, write_text
 from iga_drake.progress import counter
 
 if TYPE_CHECKING:
@@ -46,7 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--ray", nargs="?", const="", metavar="ADDRESS",
         help="on a Ray cluster; without address: the local one, started if need be",
     )  # fmt: skip
-    parser.add_argument("--results", type=Path, help="results file to append to and to go on from")
+    parser.add_argument(
+        "--results", type=results_file, help="results file to append to and to go on from"
+    )
     parser.add_argument(
         "--at-least", type=float, metavar="RATE",
         help="end with 1 where a scenario succeeds less often with one of the aligners, in [0, 1]",
@@ -55,14 +60,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--compare", type=Path, metavar="FILE",
         help="earlier results file (of --results): tell which trials changed",
     )  # fmt: skip
-    parser.add_argument("--junit", type=Path, metavar="FILE", help="write JUnit's XML")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write a summary")
+    junit = partial(output_file, begins=(b"<?xml",))
+    parser.add_argument("--junit", type=junit, metavar="FILE", help="write JUnit's XML")
+    markdown = partial(output_file, begins=(b"| scenario",))
+    parser.add_argument("--markdown", type=markdown, metavar="FILE", help="write a summary")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Runs the trials, tells each verdict, prints the table."""
-    from iga_drake.evaluation.results import ResultsStore
     from iga_drake.evaluation.task_reports import (
         compare_trials,
         junit_xml,
@@ -87,8 +93,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise CommandError(f"--at-least {arguments.at_least}: must lie in [0, 1]")
     if arguments.processes is not None and arguments.processes < 1:
         raise CommandError(f"--processes {arguments.processes}: at least 1 is needed")
-    check_output(arguments.junit, begins=(b"<?xml",))
-    check_output(arguments.markdown, begins=(b"| scenario",))
     before = read_trials(arguments.compare) if arguments.compare else None
     store = ResultsStore(arguments.results) if arguments.results else None
     trials = _trials(arguments)
@@ -102,19 +106,14 @@ def run(arguments: argparse.Namespace) -> int:
         shown.write(_line(result), file=sys.stderr)
         shown.update()
 
-    try:
-        with shown:
-            results = evaluate(
-                trials,
-                processes=arguments.processes or width,
-                store=store,
-                on_result=show,
-                run=one,
-            )
-    except KeyboardInterrupt:
-        if store:
-            print(f"results so far are in {store.path}", file=sys.stderr)
-        raise
+    with shown, kept_on_interrupt(lambda: results_kept(arguments.results)):
+        results = evaluate(
+            trials,
+            processes=arguments.processes or width,
+            store=store,
+            on_result=show,
+            run=one,
+        )
     summary = summarise_trials(results)
     comparison = None if before is None else compare_trials(before, results)
     if arguments.json:

@@ -2,9 +2,9 @@
 
 import argparse
 import json
-from pathlib import Path
 from typing import Any
 
+from iga_drake.files import output_folder
 from iga_drake.shapes.errors import ShapeError
 
 _LARGE = 10.0  # m, more than anything on a table has
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     sdf = kinds.add_parser("sdf", help="write an instance that Drake loads")
     sdf.add_argument("family", help="a name that `iga shapes list` prints")
     sdf.add_argument("--seed", type=int, default=0, help="which instance (default 0)")
-    sdf.add_argument("--out", type=Path, required=True, metavar="DIR")
+    sdf.add_argument("--out", type=output_folder, required=True, metavar="DIR")
     sdf.add_argument("--name", help="of the model, link and file (default: family_seed)")
     sdf.add_argument("--mass", type=float, metavar="KG", help="default: from the density")
     read = kinds.add_parser("read", help="read and clean meshes, and say which can't be used")

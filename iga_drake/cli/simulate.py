@@ -5,6 +5,7 @@ import json
 import math
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,8 @@ from iga_drake.cli.scenarios import (
     with_aligner,
 )
 from iga_drake.cli.status import FAILURE, SUCCESS
-from iga_drake.files import check_output, write_text
+from iga_drake.files import output_file, write_text
+from iga_drake.viewing.figures import figure_file
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -61,25 +63,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(default in a terminal)",
     )  # fmt: skip
     parser.add_argument(
-        "--html", type=Path, metavar="OUT", help="write a replay with time line, verdict and errors"
+        "--html",
+        type=output_file,
+        metavar="OUT",
+        help="write a replay with time line, verdict and errors",
     )
     parser.add_argument(
-        "--png", type=Path, metavar="OUT", help="write a picture of every phase (needs matplotlib)"
+        "--png",
+        type=figure_file,
+        metavar="OUT",
+        help="write a picture of every phase (needs matplotlib)",
     )
     add_record_arguments(parser)
-    parser.add_argument("--result", type=Path, metavar="JSON", help="write the result as JSON")
+    result = partial(output_file, begins=(b'{"task"',))
+    parser.add_argument("--result", type=result, metavar="JSON", help="write the result as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Runs the episode, tells how it goes, writes what was asked for."""
     from iga_drake.station.log.writer import check_new_log
-    from iga_drake.viewing.figures import check_figure
 
-    check_output(arguments.html)  # before minutes of simulation
-    check_output(arguments.png)
-    check_figure(arguments.png)
-    check_output(arguments.result, begins=(b'{"task"',))
-    check_new_log(arguments.record)
+    check_new_log(arguments.record)  # before minutes of simulation
     scenario = scenario_of(arguments)
     name = arguments.aligner or scenario.aligner.name
     scenario = with_aligner(scenario, name, aligner_options(arguments, [name])[name])

@@ -10,10 +10,13 @@ from pathlib import Path
 import torch
 
 from iga_drake.cli import train_dif_net, train_encoder, train_familiarity, train_paper
+from iga_drake.errors import kept_on_interrupt
+from iga_drake.files import output_folder
 from iga_drake.training.descriptor import DescriptorSettings, train_descriptor
 from iga_drake.training.energy import EnergySettings, train_energy
 from iga_drake.training.options import add_run_options, run_options, with_options
 from iga_drake.training.ranks import process_group
+from iga_drake.training.run import training_kept
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +44,9 @@ def _add_energy(parser: argparse.ArgumentParser) -> None:
     add_run_options(parser)
     parser.add_argument("--descriptor", type=Path, help="weights that match (default: the landed)")
     parser.add_argument(
-        "--problems", type=Path, help="folder where problems are kept (default: OUT/problems)"
+        "--problems",
+        type=output_folder,
+        help="folder where problems are kept (default: OUT/problems)",
     )
 
 
@@ -73,6 +78,11 @@ def _train_energy(arguments: argparse.Namespace) -> int:
 def run(arguments: argparse.Namespace) -> int:
     """Runs the training; a run that was stopped (or killed) goes on from its last checkpoint."""
     torch.set_num_threads(arguments.threads)
+    with kept_on_interrupt(lambda: training_kept(arguments.out)):
+        return _train(arguments)
+
+
+def _train(arguments: argparse.Namespace) -> int:
     if arguments.network == "encoder":
         return train_encoder.run(arguments)
     torch.set_flush_denormal(True)

@@ -3,13 +3,14 @@
 import argparse
 from pathlib import Path
 
+from iga_drake.files import output_folder
 from iga_drake.training.familiarity import FamiliarityTraining, train_familiarity
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga train familiarity`."""
     default = FamiliarityTraining()
-    parser.add_argument("--out", type=Path, required=True, help="folder of the weights")
+    parser.add_argument("--out", type=output_folder, required=True, help="folder of the weights")
     parser.add_argument("--descriptor", type=Path, help="weights that match (default: the landed)")
     parser.add_argument(
         "--samples", type=int, default=default.samples,

@@ -8,6 +8,7 @@ import torch
 
 from iga_drake.aligners.iga_paper.graph import SIZES
 from iga_drake.aligners.iga_paper.model import OUTPUTS, kind_of, write_half
+from iga_drake.files import output_file
 from iga_drake.training.options import FIELDS as OPTIONS
 from iga_drake.training.options import add_run_options, run_options, with_options
 from iga_drake.training.paper import PaperSettings, default_model, train_paper
@@ -34,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--half",
-        type=Path,
+        type=output_file,
         metavar="OUT",
         help="afterwards copy the weights, the best where some were chosen, in half precision",
     )

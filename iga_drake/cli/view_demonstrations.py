@@ -3,14 +3,14 @@
 import argparse
 from pathlib import Path
 
-from iga_drake.files import check_output, write_text
+from iga_drake.files import output_file, write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga view demonstrations`."""
     parser.add_argument("folder", type=Path)
     parser.add_argument(
-        "--html", type=Path, metavar="OUT", help="write a page instead of serving one"
+        "--html", type=output_file, metavar="OUT", help="write a page instead of serving one"
     )
 
 
@@ -19,7 +19,6 @@ def run(arguments: argparse.Namespace) -> None:
     from iga_drake.demonstrations.store import read_demonstrations
     from iga_drake.viewing.replay import demonstrations_html, serve_demonstrations
 
-    check_output(arguments.html)
     demonstrations = read_demonstrations(arguments.folder)
     for index, demonstration in enumerate(demonstrations.demonstrations):
         clouds = ", ".join(

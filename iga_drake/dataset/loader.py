@@ -4,10 +4,14 @@ Step t of rank r holds the `batch` samples from index first + (t world + r) batc
 or ranks ever make the same sample, their number changes nothing, and a run resumes by its index.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import multiprocessing
+import signal
+import threading
 from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -96,8 +100,33 @@ def _processes() -> Any:
 
 
 def _start_worker(_: int) -> None:
-    """One thread a worker: the workers share the cores."""
+    """One thread a worker: the workers share the cores. Ctrl-C is the first process's matter, which
+    ends them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
+
+
+@contextlib.contextmanager
+def _interrupt_waits() -> Iterator[None]:
+    """Has Ctrl-C wait for the end of the block: a worker complains where nobody takes the batch
+    that it hands over. A second one doesn't wait."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield
+        return
+    asked: list[FrameType | None] = []
+
+    def ask(_: int, frame: FrameType | None) -> None:
+        asked.append(frame)
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, ask)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if asked:
+        before(signal.SIGINT, asked[0])
 
 
 class SampleLoader:
@@ -107,8 +136,14 @@ class SampleLoader:
         self._loader, self._split = loader, split
 
     def __iter__(self) -> Iterator[Batch]:
+        batches = iter(self._loader)
         try:
-            yield from self._loader
+            while True:
+                with _interrupt_waits():
+                    batch = next(batches, None)
+                if batch is None:
+                    return
+                yield batch
         except IgaDrakeError:
             raise
         except RuntimeError as error:

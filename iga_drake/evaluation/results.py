@@ -21,14 +21,28 @@ from typing import Any
 
 from iga_drake.aligners.protocol import Aligner, weights_digest
 from iga_drake.errors import IgaDrakeError
-from iga_drake.files import check_output, write_text
+from iga_drake.files import check_output, output_file, write_text
 from iga_drake.version import code_version
 
 _START = '{"key": '  # of every line
+_ANYTHING = (b"",)  # what a file begins with that isn't looked into
 
 
 class ResultsError(IgaDrakeError):
     """A results file holds something else, or can't be read."""
+
+
+def results_file(text: str) -> Path:
+    """The path of a results file, as argparse takes it: checked that one can be written there,
+    before any work is done. `ResultsStore` checks what is in it."""
+    return output_file(text, begins=_ANYTHING)
+
+
+def results_kept(path: Path | None) -> str:
+    """What is kept of an evaluation that was interrupted, in words; `path`: its results file."""
+    if path is None:
+        return "nothing is kept without --results"
+    return f"results so far are in {path}, the same command goes on from there"
 
 
 class ResultsStore:
@@ -42,7 +56,7 @@ class ResultsStore:
         self.path = path
         self._lock = threading.Lock()
         self._results: dict[str, dict[str, Any]] = {}
-        check_output(path, begins=(b"",))  # what is in it is looked at below
+        check_output(path, begins=_ANYTHING)  # what is in it is looked at below
         if path.is_file():
             self._read()
 

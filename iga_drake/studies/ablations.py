@@ -39,9 +39,9 @@ from iga_drake.aligners.protocol import Aligner, PoseEstimate
 from iga_drake.checkpoint import file_digest, save_checkpoint
 from iga_drake.dataset.samples import SampleConfig
 from iga_drake.demonstrations.alignment import Alignment
-from iga_drake.errors import IgaDrakeError
-from iga_drake.evaluation.results import ResultsStore, code_key
-from iga_drake.files import write_text
+from iga_drake.errors import IgaDrakeError, kept_on_interrupt
+from iga_drake.evaluation.results import ResultsStore, code_key, results_kept
+from iga_drake.files import output_folder, write_text
 from iga_drake.geometry.se3 import rigid
 from iga_drake.paths import models_dir
 from iga_drake.training.correspondence import DescriptorTraining
@@ -287,10 +287,15 @@ class Ablations:
     workers: int = 0
     device: str = "cpu"
 
+    @property
+    def results(self) -> Path:
+        """The file of the rows that are finished."""
+        return self.folder / "results.jsonl"
+
     def run(self, variants: Sequence[Variant]) -> Iterator[Row]:
         """The row of every variant, as they are finished. Raises `IgaDrakeError`."""
         self._check(variants)
-        store = ResultsStore(self.folder / "results.jsonl")
+        store = ResultsStore(self.results)
         for variant in variants:
             conditions = self._conditions(variant)
             key = {"kind": "ablations", "variant": variant.name, "conditions": conditions}
@@ -500,7 +505,11 @@ def add_ablations(parser: argparse.ArgumentParser) -> None:
     """Options of `iga evaluate ablations`."""
     parser.description = "What the parts of the iga aligner are worth, at equal budgets."
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="trainings, problems, results.jsonl"
+        "--out",
+        type=output_folder,
+        required=True,
+        metavar="DIR",
+        help="trainings, problems, results.jsonl",
     )
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument(
@@ -520,7 +529,9 @@ def add_ablations(parser: argparse.ArgumentParser) -> None:
         "--problem-count", type=int, default=600, metavar="N",
         help="problems that energies are trained on, a quarter with two alignments (default 600)",
     )  # fmt: skip
-    parser.add_argument("--problems", type=Path, help="folder of problems (default: in DIR)")
+    parser.add_argument(
+        "--problems", type=output_folder, help="folder of problems (default: in DIR)"
+    )
     parser.add_argument("--weights", type=Path, help="descriptors (default: the landed ones)")
     parser.add_argument("--energy", type=Path, help="energy (default: the landed one)")
     parser.add_argument("--encoder", type=Path, help="local encoder (default: the landed one)")
@@ -552,14 +563,15 @@ def evaluate_ablations(arguments: argparse.Namespace) -> int:
         **files,
     )
     rows: list[Row] = []
-    for row in ablations.run(variants):
-        if not arguments.json:
-            if not rows:
-                print(HEADER)
-            if not rows or row.group != rows[-1].group:
-                print(f"{row.group}: {ablations.measured(row.group)}")
-            print(row.text(), flush=True)
-        rows.append(row)
+    with kept_on_interrupt(lambda: results_kept(ablations.results)):
+        for row in ablations.run(variants):
+            if not arguments.json:
+                if not rows:
+                    print(HEADER)
+                if not rows or row.group != rows[-1].group:
+                    print(f"{row.group}: {ablations.measured(row.group)}")
+                print(row.text(), flush=True)
+            rows.append(row)
     if arguments.json:
         print(json.dumps([asdict(row) for row in rows], indent=2))
     return 0

@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +36,17 @@ from iga_drake.dataset.alignment_error import CONFIG, equivalents, nearest_error
 from iga_drake.dataset.loader import collate
 from iga_drake.dataset.samples import Sample, SampleConfig, make_sample
 from iga_drake.dataset.splits import sample_sets
-from iga_drake.errors import IgaDrakeError
+from iga_drake.errors import IgaDrakeError, kept_on_interrupt
 from iga_drake.evaluation.alignment import COLUMNS, Errors
-from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, config_digest
-from iga_drake.files import write_text
+from iga_drake.evaluation.results import (
+    ResultsStore,
+    aligner_key,
+    code_key,
+    config_digest,
+    results_file,
+    results_kept,
+)
+from iga_drake.files import output_file, write_text
 from iga_drake.progress import progress
 from iga_drake.training.correspondence import LOSS_FIELDS, DescriptorTraining, descriptor_loss
 from iga_drake.training.paper import (
@@ -52,7 +60,7 @@ from iga_drake.training.paper import (
     variant_loss,
 )
 from iga_drake.training.settings import replaced
-from iga_drake.viewing.figures import check_figure, new_figure, write_figure
+from iga_drake.viewing.figures import figure_file, new_figure, write_figure
 
 PARTS = {"iga-paper": ("rotation", "translation"), "dirreg": ("dirreg",), "dfm": ("dfm",)}
 DESCRIPTORS = ("iga", "iga-energy")  # of their training, that of the descriptors is counted
@@ -389,16 +397,18 @@ def add_compare(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--particles", type=int, default=LangevinConfig.particles)
     parser.add_argument("--steps", type=int, default=LangevinConfig.steps, help="of the samplers")
-    parser.add_argument("--results", type=Path, help="results file to append to and go on from")
+    parser.add_argument(
+        "--results", type=results_file, help="results file to append to and go on from"
+    )
     parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch")
-    parser.add_argument("--png", type=Path, metavar="OUT", help="figure")
-    parser.add_argument("--card", type=Path, metavar="OUT", help="model card of one aligner")
+    parser.add_argument("--png", type=figure_file, metavar="OUT", help="figure")
+    card = partial(output_file, begins=(b"#",))
+    parser.add_argument("--card", type=card, metavar="OUT", help="model card of one aligner")
     parser.add_argument("--json", action="store_true", help="print as JSON")
 
 
 def evaluate_compare(arguments: argparse.Namespace) -> None:
     """Prints a row for each aligner, its weights and each set; draws the figure."""
-    check_figure(arguments.png)
     names = [name.strip() for name in arguments.aligners.split(",") if name.strip()]
     unused = [name for name, _ in arguments.weights if name not in names]
     if unused:
@@ -410,22 +420,23 @@ def evaluate_compare(arguments: argparse.Namespace) -> None:
     rows = []
     if not arguments.json:
         print(HEADER)
-    for name in names:
-        chosen = [path for other, path in arguments.weights if other == name] or [None]
-        for path in chosen:
-            entry = trained(name, path, particles=arguments.particles, steps=arguments.steps)
-            for split in arguments.sets.split(","):
-                found = compare(
-                    entry,
-                    split.strip(),
-                    arguments.count,
-                    frames=arguments.frames,
-                    cloud_points=arguments.cloud_points,
-                    store=store,
-                )
-                rows.append(found)
-                if not arguments.json:
-                    print(found.row(), flush=True)
+    with kept_on_interrupt(lambda: results_kept(arguments.results)):
+        for name in names:
+            chosen = [path for other, path in arguments.weights if other == name] or [None]
+            for path in chosen:
+                entry = trained(name, path, particles=arguments.particles, steps=arguments.steps)
+                for split in arguments.sets.split(","):
+                    found = compare(
+                        entry,
+                        split.strip(),
+                        arguments.count,
+                        frames=arguments.frames,
+                        cloud_points=arguments.cloud_points,
+                        store=store,
+                    )
+                    rows.append(found)
+                    if not arguments.json:
+                        print(found.row(), flush=True)
     if arguments.json:
         print(json.dumps([asdict(found) for found in rows], indent=2))
     if arguments.png:

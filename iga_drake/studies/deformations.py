@@ -14,6 +14,7 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 
+from iga_drake.files import output_folder
 from iga_drake.progress import progress
 from iga_drake.shapes.deformers import LatticeDeformer, PartDeformer, ReinstancingDeformer
 from iga_drake.shapes.deformers.dif_net import DifNetDeformer, default_dif_net_weights
@@ -189,7 +190,7 @@ def add_view_deformations(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--family", action="append", metavar="NAME", help="repeatable (default: mug and bottle)"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--out", type=output_folder, required=True, metavar="DIR")
     parser.add_argument("--count", type=int, default=24)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--deformer", choices=DEFORMERS, default=DEFORMERS[0])

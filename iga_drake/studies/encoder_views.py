@@ -8,6 +8,7 @@ that truly are.
 
 import argparse
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import torch
 from iga_drake.aligners.iga.local_encoder import OccupancyNet, load_encoder
 from iga_drake.dataset.occupancy import OccupancyConfig, OccupancySample, make_occupancy_sample
 from iga_drake.dataset.splits import sample_set
+from iga_drake.files import output_file
 from iga_drake.geometry.clouds import furthest_point_sampling
 from iga_drake.paths import models_dir
 from iga_drake.progress import progress
@@ -105,7 +107,9 @@ def add_view_reconstruction(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=int, default=6, help="how many clouds (default 6)")
     parser.add_argument("--centres", type=int, default=8, help="K (default 8, the paper's)")
     parser.add_argument("--weights", type=Path, help="default: the landed encoder")
-    parser.add_argument("--png", type=Path, required=True, metavar="OUT")
+    parser.add_argument(
+        "--png", type=partial(output_file, suffix=".png"), required=True, metavar="OUT"
+    )
 
 
 def view_reconstruction(arguments: argparse.Namespace) -> int:
@@ -121,8 +125,6 @@ def view_reconstruction(arguments: argparse.Namespace) -> int:
         raise ViewError(
             f"--index: cloud {first + count - 1} asked of '{arguments.split}', it has {2 * limit}"
         )
-    if arguments.png.suffix.lower() != ".png":
-        raise ViewError(f"--png {arguments.png}: name a file that ends in .png")
     from iga_drake.viewing.shape_sheets import write_png
 
     weights = arguments.weights or models_dir() / "weights" / "encoder.safetensors"

@@ -16,9 +16,10 @@ from torch import Tensor
 from iga_drake.aligners.iga.aligner import Explanation, IgaAligner
 from iga_drake.aligners.query import Query
 from iga_drake.dataset.splits import sample_set
+from iga_drake.files import output_file, output_folder
 from iga_drake.studies.diagnosis import Problem, step_from
 from iga_drake.viewing.dataset_views import ViewError
-from iga_drake.viewing.figures import check_figure, new_figure, write_figure
+from iga_drake.viewing.figures import check_matplotlib, new_figure, write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -439,8 +440,8 @@ def add_view_energy(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--index", type=int, default=0, help="of the sample (default 0)")
     parser.add_argument("--demonstrations", type=int, default=4, help="default 4")
     parser.add_argument("--weights", type=Path, help="of iga (default: the landed ones)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write figures there")
-    parser.add_argument("--html", type=Path, metavar="OUT", help="write a page, serve none")
+    parser.add_argument("--out", type=output_folder, metavar="DIR", help="write figures there")
+    parser.add_argument("--html", type=output_file, metavar="OUT", help="write a page, serve none")
 
 
 def view_energy(arguments: argparse.Namespace) -> int:
@@ -456,7 +457,7 @@ def view_energy(arguments: argparse.Namespace) -> int:
             f"--demonstrations {arguments.demonstrations}: '{arguments.split}' has 1 to "
             f"{chosen.pairs - 1}"
         )
-    check_figure((arguments.out or Path()) / "landscape.png")
+    check_matplotlib()
     explained = ExplainedProblem.of(
         IgaAligner(weights=arguments.weights),
         arguments.split,

@@ -21,7 +21,7 @@ from iga_drake.errors import IgaDrakeError
 from iga_drake.evaluation.alignment import COLUMNS, Errors
 from iga_drake.progress import progress
 from iga_drake.studies.diagnosis import Problem
-from iga_drake.viewing.figures import check_figure, new_figure, write_figure
+from iga_drake.viewing.figures import figure_file, new_figure, write_figure
 
 SCALING_SET = "diversity_medium"
 DIVERSITY_SETS = ("diversity_low", "diversity_medium", "diversity_high")
@@ -327,7 +327,7 @@ def _add_common(parser: argparse.ArgumentParser, numbers: Sequence[int], count: 
     )  # fmt: skip
     parser.add_argument("--count", type=int, default=count, help=f"samples (default {count})")
     parser.add_argument("--weights", type=Path, help="of iga (default: the landed ones)")
-    parser.add_argument("--png", type=Path, metavar="OUT", help="write a figure")
+    parser.add_argument("--png", type=figure_file, metavar="OUT", help="write a figure")
     parser.add_argument("--json", action="store_true", help="print the table as JSON")
 
 
@@ -339,7 +339,6 @@ def add_evaluate_scaling(parser: argparse.ArgumentParser) -> None:
 
 def evaluate_scaling(arguments: argparse.Namespace) -> int:
     """Runs `iga evaluate scaling`; returns the exit status."""
-    check_figure(arguments.png)
     costs = measure_costs(
         IgaAligner(weights=arguments.weights), arguments.demonstrations, arguments.count
     )
@@ -366,7 +365,6 @@ def add_evaluate_diversity(parser: argparse.ArgumentParser) -> None:
 
 def evaluate_diversity(arguments: argparse.Namespace) -> int:
     """Runs `iga evaluate diversity`; returns the exit status."""
-    check_figure(arguments.png)
     aligner = IgaAligner(weights=arguments.weights)
     rows = []
     if not arguments.json:

@@ -29,7 +29,7 @@ from iga_drake.systems.ports import Role
 from iga_drake.tasks.distractors import with_distractors
 from iga_drake.tasks.episode import TEST_SEED_OFFSET, demonstrations_path
 from iga_drake.tasks.registry import scenario_task
-from iga_drake.viewing.figures import check_figure, new_figure, write_figure
+from iga_drake.viewing.figures import figure_file, new_figure, write_figure
 
 _COUNTED = {"target": Role.TARGET, "grasped": Role.GRASPED}
 _TASKS = ("grasp", "stack", "sweep", "hang", "insert", "pour")
@@ -231,7 +231,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=int, default=5, help="scenes of each task")
     parser.add_argument("--seed", type=int, default=0, help="of the first scene")
     parser.add_argument("--distractors", type=int, default=0, help="further objects in each scene")
-    parser.add_argument("--png", type=Path, help="picture of the labels of the last look")
+    parser.add_argument("--png", type=figure_file, help="picture of the labels of the last look")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -241,7 +241,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise IgaDrakeError(
             f"--count {arguments.count} --seed {arguments.seed}: at least 1 and 0 are needed"
         )
-    check_figure(arguments.png)
     results = []
     for name in arguments.tasks.split(","):
         scenario = load_scenario(name, overrides=[f"distractors={arguments.distractors}"])

@@ -22,6 +22,7 @@ from iga_drake.aligners.iga_paper.search import energy_of
 from iga_drake.dataset.loader import collate
 from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.errors import IgaDrakeError
+from iga_drake.files import output_folder
 from iga_drake.geometry.se3 import geodesic_angle, so3_exp
 from iga_drake.progress import progress
 from iga_drake.training.paper import (
@@ -153,7 +154,9 @@ def add_stabilisers(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--weights", type=Path, nargs="*", default=[], help="of trained networks to look at"
     )
-    parser.add_argument("--out", type=Path, help="train the ablation in folders of this one")
+    parser.add_argument(
+        "--out", type=output_folder, help="train the ablation in folders of this one"
+    )
     parser.add_argument("--size", choices=SIZES, default="small")
     parser.add_argument("--steps", type=int, default=400, help="of each training")
     parser.add_argument("--subset", type=int, default=50, help="samples trained on, over and over")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from iga_drake.errors import IgaDrakeError
-from iga_drake.viewing.figures import check_figure, new_figure, write_figure
+from iga_drake.viewing.figures import figure_file, new_figure, write_figure
 
 ENERGIES = {"energy_max": "highest", "energy_true": "of the right pose", "energy_min": "lowest"}
 
@@ -93,12 +93,11 @@ def add_training_log(parser: argparse.ArgumentParser) -> None:
     """Options of `iga evaluate training-log`."""
     parser.description = "Loss and energies of trainings over their steps."
     parser.add_argument("folders", type=Path, nargs="+", help="of trainings")
-    parser.add_argument("--png", type=Path, required=True, metavar="OUT")
+    parser.add_argument("--png", type=figure_file, required=True, metavar="OUT")
 
 
 def evaluate_training_log(arguments: argparse.Namespace) -> None:
     """Draws the figure and prints where the logs end."""
-    check_figure(arguments.png)
     logs = {}
     for folder in arguments.folders:
         name = folder.name if folder.is_dir() else folder.parent.name

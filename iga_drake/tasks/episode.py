@@ -374,9 +374,9 @@ class Episode:
         self._begin()
 
     def close(self) -> None:
-        """Ends the aligner's process and the log, and lets go of the diagram's state, some hundred MB
-        that Drake keeps otherwise for as long as Python runs: Python's systems are never collected.
-        What was seen before (`snapshots`, a result) stays."""
+        """Ends the aligner's process and the log, and lets go of the diagram's state, some hundred
+        MB that Drake keeps otherwise for as long as Python runs: Python's systems are never
+        collected. What was seen before (`snapshots`, a result) stays."""
         self.inference.close()
         if self.log is not None:
             self.log.close()

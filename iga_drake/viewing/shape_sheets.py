@@ -20,8 +20,9 @@ from pydrake.geometry import (
     SceneGraph,
 )
 from pydrake.math import RigidTransform
-from pydrake.systems.sensors import CameraInfo, ImageIo, ImageRgb8U
+from pydrake.systems.sensors import CameraInfo, ImageFileFormat, ImageIo, ImageRgb8U
 
+from iga_drake.files import output_folder, replacing
 from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.families import FAMILIES
 from iga_drake.shapes.instance import ShapeInstance
@@ -116,7 +117,7 @@ def add_view_shapes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--family", action="append", metavar="NAME", help="repeatable (default: every family)"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--out", type=output_folder, required=True, metavar="DIR")
     parser.add_argument("--count", type=int, default=24, help="products a sheet (default 24)")
     parser.add_argument("--seed", type=int, default=0)
 
@@ -133,13 +134,12 @@ def view_shapes(arguments: argparse.Namespace) -> int:
 
 
 def write_png(image: np.ndarray, path: Path | str) -> None:
-    """Writes (H, W, 3) uint8 as a PNG file; missing folders are made."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Writes (H, W, 3) uint8 as a PNG file, whole or not at all; missing folders are made."""
     height, width, _ = image.shape
     out = ImageRgb8U(width, height)
     out.mutable_data[:] = image
-    ImageIo().Save(out, path.with_suffix(".png"))
+    with replacing(Path(path).with_suffix(".png")) as partial:
+        ImageIo().Save(out, partial, ImageFileFormat.kPng)
 
 
 def _view(azimuth: float, elevation: float) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,8 +15,12 @@ from iga_drake.cli import shapes
 from iga_drake.cli.options import add_aligner_options, aligner_options
 from iga_drake.cli.status import CommandError
 from iga_drake.demonstrations.store import write_demonstrations
+from iga_drake.errors import kept_on_interrupt
 from iga_drake.paths import diagrams_dir
+from iga_drake.station.scenario import load_scenario
+from iga_drake.tasks.episode import Episode
 from iga_drake.tasks.registry import make_task
+from iga_drake.viewing.meshcat import start_meshcat
 
 
 def refused(capsys: pytest.CaptureFixture, *arguments: str) -> str:
@@ -102,9 +107,16 @@ def test_an_interrupt_ends_quietly(capsys, monkeypatch):
     def interrupted(arguments):
         raise KeyboardInterrupt
 
+    def interrupted_later(arguments):
+        with kept_on_interrupt(lambda: "two files are kept"):
+            raise KeyboardInterrupt
+
     monkeypatch.setattr(shapes, "run", interrupted)
     assert cli.main(["shapes", "list"]) == cli.INTERRUPTED == 130
     assert capsys.readouterr().err == "iga shapes: interrupted\n"
+    monkeypatch.setattr(shapes, "run", interrupted_later)
+    assert cli.main(["shapes", "list"]) == cli.INTERRUPTED
+    assert capsys.readouterr().err == "iga shapes: interrupted; two files are kept\n"
 
 
 def test_a_full_disk_is_no_bug(capsys, monkeypatch):
@@ -309,3 +321,35 @@ def test_a_live_run_without_a_terminal_neither_waits_nor_stays(monkeypatch, caps
     assert cli.main([*command, "--realtime", "0.5"]) == cli.SUCCESS
     assert seeds == [3, 4] and rates == [0.5, 0.5]
     assert "meshcat: http://localhost:" in capsys.readouterr().out
+
+
+def test_stepping_by_hand_with_meshcat_gives_the_command_s_numbers(tmp_path: Path):
+    """As the first notebook says; until the first pose is inferred and the arm moves."""
+    changes = ["task.time_limit=0.7", "policy.infer_limit=600"]
+    path = tmp_path / "result.json"
+    command = ["simulate", "grasp", "--seed", "3", "--result", str(path)]
+    assert cli.main([*command, *(f"--set={change}" for change in changes)]) == cli.FAILURE
+    scenario = load_scenario("grasp", overrides=changes)
+    with Episode(scenario, seed=3, meshcat=start_meshcat()) as episode:
+        episode.step(0.4)
+        station = episode.robot.station
+        context = station.GetMyContextFromRoot(episode.simulator.get_context())
+        image = station.GetOutputPort(f"{scenario.camera_names[0]}.color_image").Eval(context)
+        assert image.width() > 0
+        while not episode.memory.estimates:
+            episode.step()
+        result = episode.run()
+
+    def numbers(row: dict) -> dict:
+        """A row without what the clock on the wall says."""
+        row = {k: v for k, v in row.items() if not k.endswith("_seconds") and "real_time" not in k}
+        row["waypoints"] = [w | {"inference_seconds": 0} for w in row["waypoints"]]
+        row["timeline"] = [
+            entry | {"detail": re.sub(r", [\d.]+ s$", "", entry["detail"])}
+            for entry in row["timeline"]
+        ]
+        return row
+
+    found = numbers(json.loads(json.dumps(result.row())))
+    assert found == numbers(json.loads(path.read_text()))
+    assert found["waypoints"] and found["timeline"][-1]["phase"] == "move"

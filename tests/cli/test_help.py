@@ -1,42 +1,18 @@
 """What the commands say of themselves: helps, versions, lists of names."""
 
-import argparse
-import importlib
 import json
 import re
 import sys
 
 import pytest
+from every_parser import parsers
 
 from iga_drake import __version__, cli
 from iga_drake.cli.parser import CommandParser
-from iga_drake.cli.subcommands import subcommand_parser
 from iga_drake.dataset.splits import sample_set
 from iga_drake.errors import missing_extra
 from iga_drake.station.scenario import load_scenario
 from iga_drake.tasks.registry import make_task
-
-
-def parsers() -> list[CommandParser]:
-    """The parser of every verb and of every part of one."""
-    found: list[CommandParser] = []
-
-    def add(parser: argparse.ArgumentParser) -> None:
-        assert isinstance(parser, CommandParser)
-        found.append(parser)
-        for action in parser._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                for child in action.choices.values():
-                    add(child)
-
-    for verb in cli.COMMANDS:
-        module = importlib.import_module(f"iga_drake.cli.{verb}")
-        parser = CommandParser(prog=f"iga {verb}")
-        module.add_arguments(parser)
-        add(parser)
-        for what, chosen in getattr(module, "SUBCOMMANDS", {}).items():  # modules of their own
-            add(subcommand_parser(verb, what, chosen))
-    return found
 
 
 def test_every_option_says_its_default() -> None:

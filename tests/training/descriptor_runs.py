@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -40,8 +41,11 @@ def write_settings(folder: Path, **training) -> Path:
     return path
 
 
-def command(*options: object, launcher: tuple[str, ...] = ()) -> subprocess.Popen:
-    """`iga train descriptor` in a process of its own."""
+def command(
+    *options: object, launcher: tuple[str, ...] = (), own_group: bool = False
+) -> subprocess.Popen:
+    """`iga train descriptor` in a process of its own; `own_group`: as a terminal's shell starts it,
+    in a group of processes that doesn't ignore Ctrl-C."""
     start = (*launcher, "-m", "iga_drake.cli", "train", "descriptor", "--device", "cpu")
     return subprocess.Popen(
         [sys.executable, *start, *map(str, options)],
@@ -49,7 +53,13 @@ def command(*options: object, launcher: tuple[str, ...] = ()) -> subprocess.Pope
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
+        start_new_session=own_group,
+        preexec_fn=_heed_interrupts if own_group else None,
     )
+
+
+def _heed_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # what runs in the background may ignore it
 
 
 def state(folder: Path) -> tuple[dict[str, torch.Tensor], dict]:

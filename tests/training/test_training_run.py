@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import sys
 import time
@@ -159,6 +160,25 @@ def test_tensorboard_that_is_not_there_is_an_error(tmp_path: Path, monkeypatch) 
     with pytest.raises(TrainingError, match=r"pip install 'iga-drake\[train\]'"):
         _train(tmp_path, RunConfig(steps=1), tensorboard=True)
     _train(tmp_path, RunConfig(steps=1))
+
+
+def test_ctrl_c_ends_a_training_with_one_line_that_says_what_is_kept(tmp_path: Path) -> None:
+    """As a terminal sends it: to all processes of the command."""
+    settings = write_settings(tmp_path, steps=100_000)
+    options = ("--config", settings, "--workers", 1, "--checkpoint-every", 1)
+    process = command("--out", tmp_path / "run", *options, own_group=True)
+    while process.poll() is None and not (tmp_path / "run" / "state.safetensors").is_file():
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    try:
+        said, _ = process.communicate(timeout=300)
+    finally:
+        process.kill()
+    assert process.returncode == cli.INTERRUPTED, said
+    told = [line for line in said.splitlines() if not line.startswith("step ")]
+    assert len(told) == 1, said
+    found = re.match(r"iga train: interrupted; step (\d+) is kept in \S+/run, the same", told[0])
+    assert found and int(found[1]) == state(tmp_path / "run")[1]["step"] >= 1, said
 
 
 def test_a_run_killed_at_any_moment_ends_as_if_it_had_not_been(tmp_path: Path) -> None:

@@ -5,10 +5,11 @@ import time
 from pathlib import Path
 
 import pytest
-from browser import Browser, needs_browser
+from browser import Browser, click, needs_browser
 from view_fixtures import END, ENERGIES, PROBABILITIES, shown_run
 
-from iga_drake.viewing.meshcat import RunButtons, wait_for_browser
+from iga_drake.viewing.meshcat import RunButtons, start_meshcat, wait_for_browser
+from iga_drake.viewing.policy_views import show_text
 from iga_drake.viewing.replay import replay_html
 
 pytestmark = needs_browser
@@ -22,7 +23,15 @@ FIND = """
 }
 """
 
-FIND_TEXT = "viewer.scene_tree.find(['Cameras', 'default', 'rotated', '<object>', 'text']).children"
+# The words of the texts that are loaded and seen.
+TEXT_NODES = (
+    "viewer.scene_tree.find(['Cameras', 'default', 'rotated', '<object>', 'text']).children"
+)
+TEXTS = f"""
+Object.values({TEXT_NODES})
+  .filter(text => text.object.visible)
+  .flatMap(text => Object.keys(text.children)).filter(name => name != '<object>')
+"""
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +65,7 @@ def test_live_page(browser, monkeypatch):
     buttons = RunButtons(meshcat)
     try:
         browser.open(meshcat.web_url())
-        assert wait_for_browser(meshcat, 60.0)
+        assert wait_for_browser(meshcat, 300.0)
         for path in (
             "observed/pan", "predicted/grasp/modes", "predicted/grasp/chosen/hand",
             "ahead/2 at grasp", "cameras/left/frustum",
@@ -68,7 +77,8 @@ def test_live_page(browser, monkeypatch):
             if entry.phase.value == "infer"
         )
         browser.wait_for(has_shape(image))  # a textured plane, which loads by itself
-        assert "move grasp" in browser.evaluate(f"Object.keys({FIND_TEXT}).join()")
+        (text,) = browser.evaluate(TEXTS)
+        assert "move grasp" in text
         # It hangs before the camera; the chosen mode is shown as such alone.
         browser.wait_for("viewer.camera.children.length")
         first, second = (
@@ -78,14 +88,9 @@ def test_live_page(browser, monkeypatch):
         )
         assert not browser.evaluate(is_visible(first)) and browser.evaluate(is_visible(second))
 
-        def click(name: str) -> None:
-            script = (
-                "(() => { const [line] = [...document.querySelectorAll('.dg li.function')]"
-                f".filter(e => e.innerText.trim() == {json.dumps(name)});"
-                " line.click(); return true; })()"
-            )
+        def press(name: str) -> None:
             before = meshcat.GetButtonClicks(name)
-            assert browser.evaluate(script)
+            click(browser, name)
             for _ in range(500):
                 if meshcat.GetButtonClicks(name) > before:
                     return
@@ -93,17 +98,35 @@ def test_live_page(browser, monkeypatch):
             pytest.fail(f"a click on '{name}' didn't arrive")
 
         assert buttons.proceed()
-        click(RunButtons.STEP)  # pauses, and lets one step through
+        press(RunButtons.STEP)  # pauses, and lets one step through
         assert buttons.proceed()
         with monkeypatch.context() as patch, pytest.raises(Waits):
             patch.setattr("iga_drake.viewing.meshcat.time", Waits)
             buttons.proceed()
-        click(RunButtons.PAUSE)
+        press(RunButtons.PAUSE)
         assert buttons.proceed() and buttons.proceed()
-        click(RunButtons.RESTART)
+        press(RunButtons.RESTART)
         assert buttons.restarts and not buttons.proceed()
     finally:
         buttons.remove()
+    assert browser.errors == []
+
+
+def test_of_texts_that_follow_each_other_quickly_the_last_is_seen(browser):
+    meshcat = start_meshcat()
+    browser.open(meshcat.web_url())
+    assert wait_for_browser(meshcat, 300.0)
+    for words in ("one", "two", "three"):
+        show_text(meshcat, [words])
+    loaded = f"Object.keys({TEXT_NODES}).length == 3 && " + " && ".join(
+        f"{TEXT_NODES}[{number}].children.{words}.children['<object>']"
+        for number, words in enumerate(("one", "two", "three"))
+    )
+    browser.wait_for(loaded)
+    assert browser.evaluate(TEXTS) == ["three"]
+    show_text(meshcat, [])
+    browser.wait_for(f"({TEXTS}).length == 0")
+    browser.open("about:blank")  # before the server ends
     assert browser.errors == []
 
 
