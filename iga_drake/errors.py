@@ -44,6 +44,7 @@ _SHORT = _short()
 # Modules of optional packages -> the extra of this project that installs them.
 _EXTRAS = {
     "collada": "visuals",
+    "cv2": "calibration",
     "fast_simplification": "meshes",
     "franka": "franka",
     "igl": "dif-net",
@@ -51,6 +52,7 @@ _EXTRAS = {
     "manifold3d": "dif-net",
     "matplotlib": "notebook",
     "open3d": "icp",
+    "pyrealsense2": "realsense",
     "ray": "cluster",
     "tensorboard": "train",
     "torch_geometric": "geometric",

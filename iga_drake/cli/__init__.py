@@ -37,7 +37,8 @@ _OUTSIDE = {
 COMMANDS = {
     "simulate": "run one episode of a scenario",
     "demonstrate": "let the scripted expert record demonstrations",
-    "drive": "drivers beside the hardware: the Panda",
+    "drive": "drivers beside the hardware: the Panda, RealSense cameras",
+    "calibrate": "measure where cameras stand, and whether they still do",
     "view": "look at demonstrations, shapes, samples, deformations",
     "evaluate": "tasks, alignments and where their errors come from, deformations",
     "benchmark": "time a part",
