@@ -11,6 +11,9 @@ SUBCOMMANDS = {
         "iga_drake.studies.ablations", "what the parts of the iga aligner are worth",
         "add_ablations", "evaluate_ablations",
     ),
+    "calibration": Subcommand(
+        "iga_drake.studies.calibration", "calibrations of cameras beside their true poses"
+    ),
     "compare": Subcommand(
         "iga_drake.studies.compare", "the paper's model beside the default",
         "add_compare", "evaluate_compare",
