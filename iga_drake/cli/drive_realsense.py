@@ -63,14 +63,14 @@ def run(arguments: argparse.Namespace) -> int:
     )
     settings.check("--")
     live, played = (_pairs(option, getattr(arguments, option)) for option in ("camera", "play"))
-    if not live and not played or live.keys() & played.keys():
-        raise CommandError("--camera NAME=SERIAL or --play NAME=FILE.bag, each NAME once, is needed")
+    if not (live or played) or live.keys() & played.keys():
+        raise CommandError(
+            "--camera NAME=SERIAL or --play NAME=FILE.bag, each NAME once, is needed"
+        )
     cameras: list[RealSenseCamera] = []
     try:
         for name, serial in live.items():
-            cameras.append(
-                open_realsense(name, serial, settings, allow_usb2=arguments.allow_usb2)
-            )
+            cameras.append(open_realsense(name, serial, settings, allow_usb2=arguments.allow_usb2))
         for name, path in played.items():
             cameras.append(play_realsense(name, path, once=arguments.once))
         return _drive(cameras, settings, url, once=arguments.once)

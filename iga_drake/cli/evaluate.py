@@ -33,6 +33,9 @@ SUBCOMMANDS = {
     "familiarity": Subcommand(
         "iga_drake.studies.familiarity", "how often own objects are refused, foreign ones accepted"
     ),
+    "moved-cameras": Subcommand(
+        "iga_drake.studies.moved_cameras", "displacements of cameras that the arm's shape shows"
+    ),
     "scaling": Subcommand(
         "iga_drake.studies.scaling", "time and memory by number of demonstrations",
         "add_evaluate_scaling", "evaluate_scaling",

@@ -237,8 +237,9 @@ class CameraBridge:
         """Whether the frame wasn't there before; counts what is lost and repeated."""
         last, self._last = self._last, frame
         if last is not None and frame.number > last.number + 1:
-            self._count("dropped", frame.number - last.number - 1, "images were lost on the way: "
-                        "a port of its own for each camera, a shorter cable, fewer images (--fps)")  # fmt: skip
+            advice = "a port of its own for each camera, a shorter cable, fewer images (--fps)"
+            number = frame.number - last.number - 1
+            self._count("dropped", number, f"images were lost on the way: {advice}")
         if frame.spread > _APART / self._settings.fps:
             self._count("apart", 1, "frames have colour and depth of different moments")
         if last is not None and frame.number == last.number:

@@ -125,9 +125,7 @@ def render_board(
         for i in range(2)
     ]
     wall = rng.uniform(60, 150)
-    found = cv2.remap(
-        texture, *places, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0,
-    ).astype(np.float32)  # fmt: skip
+    found = cv2.remap(texture, *places, interpolation=cv2.INTER_LINEAR).astype(np.float32)
     inside = (places[0] >= 0) & (places[0] < texture.shape[1] - 1)
     inside &= (places[1] >= 0) & (places[1] < texture.shape[0] - 1)
     found = errors.black + (errors.white - errors.black) / 255 * found
@@ -275,7 +273,9 @@ def _length(vector: np.ndarray) -> float:
 
 def calibration_table(trials: Sequence[CalibrationTrial]) -> str:
     """Median, 90th percentile and worst of each mounting, as text."""
-    lines = [f"{'board':<9}{'cameras':>8}{'images':>8}  {'':<22}{'median':>8}{'90 %':>8}{'worst':>8}"]
+    lines = [
+        f"{'board':<9}{'cameras':>8}{'images':>8}  {'':<22}{'median':>8}{'90 %':>8}{'worst':>8}"
+    ]
     for mounting in dict.fromkeys(trial.mounting for trial in trials):
         mine = [trial for trial in trials if trial.mounting == mounting]
         rows = {

@@ -81,7 +81,12 @@ class FakeSource:
         self.queue: list[Any] = []
 
     def put(
-        self, number: int, *, color_number: int | None = None, late: float = 0.0, units: float = 1e-3
+        self,
+        number: int,
+        *,
+        color_number: int | None = None,
+        late: float = 0.0,
+        units: float = 1e-3,
     ) -> None:
         time = NOW + number / 30
         depth = FakeFrame(RAW, number, time, units)
@@ -334,6 +339,4 @@ def test_a_lens_is_rectified():
     # Brightness that is a plane in the lens' pixels comes out as the map's own coordinates.
     rows = np.repeat(np.arange(H, dtype=np.float32)[:, None], W, axis=1)
     inside = (where[0] > 0) & (where[0] < H - 1) & (where[1] > 0) & (where[1] < W - 1)
-    np.testing.assert_allclose(
-        rectify(rows, where, order=1)[inside], where[0][inside], atol=1e-3
-    )
+    np.testing.assert_allclose(rectify(rows, where, order=1)[inside], where[0][inside], atol=1e-3)

@@ -144,7 +144,7 @@ def write_board(path: Path, board: CharucoBoard) -> str:
         f"{1000 * _RULER:g} mm   {board.columns} x {board.rows} squares of {1000 * board.square:g} "
         f"mm, markers {1000 * board.marker:g} mm, {board.dictionary}"
     )
-    where = (left + length + 2 * tick, y - tick)
+    where = (left, y + 2 * tick)
     draw.text(where, text, fill=0, font_size=round(0.0032 * per_metre))
     file = io.BytesIO()
     dpi = per_metre * 0.0254

@@ -137,8 +137,8 @@ def _check_pose(where: str, measurements: Measurements, pose: MeasuredPose) -> N
         if wrong.any():
             joint = int(np.flatnonzero(wrong)[0])
             raise MeasurementError(
-                f"{where}.joints: joint {joint + 1} at {joints[joint]:g} rad is outside its limits: "
-                "are they in degrees?"
+                f"{where}.joints: joint {joint + 1} at {joints[joint]:g} rad is outside its "
+                "limits: are they in degrees?"
             )
 
 

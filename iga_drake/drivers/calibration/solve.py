@@ -258,7 +258,9 @@ class _Fit:
 
     def outlier_limit(self) -> float:
         """Error (px) above which an image is an outlier."""
-        return max(_OUTLIER, _OUTLIER_RATIO * float(np.median([self.error(s) for s in self.sights])))
+        return max(
+            _OUTLIER, _OUTLIER_RATIO * float(np.median([self.error(s) for s in self.sights]))
+        )
 
     def reject_outliers(self) -> None:
         """Fits again without the images that don't fit, until all do."""
@@ -308,16 +310,16 @@ class _Fit:
                 X_WC = self._closed_form(some)
                 if X_WC is None:
                     continue
-                held = [
-                    self._carriers[s.pose].inverse() @ X_WC @ self._seen[id(s)] for s in mine
-                ]
+                held = [self._carriers[s.pose].inverse() @ X_WC @ self._seen[id(s)] for s in mine]
                 middle = np.median([X.translation() for X in held], axis=0)
                 off = np.median([np.linalg.norm(X.translation() - middle) for X in held])
                 tries.append((float(off), X_WC, held, middle))
                 if not self._in_gripper and k >= len(mine):
                     break
             if not tries:
-                raise MeasurementError(f"{name}: no camera pose fits its images: tilt the board more")
+                raise MeasurementError(
+                    f"{name}: no camera pose fits its images: tilt the board more"
+                )
             off, X_WC, held, middle = min(tries, key=lambda each: each[0])
             found.append(_vector(X_WC.inverse()))
             nearest = min(held, key=lambda X: float(np.linalg.norm(X.translation() - middle)))
