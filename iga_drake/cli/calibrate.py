@@ -31,7 +31,7 @@ SUBCOMMANDS = {
         _HERE, "does the arm appear where the calibration says?", "add_check_arguments", "run_check"
     ),
 }  # fmt: skip
-_URL = "udpm://239.255.76.67:7667?ttl=0"
+_URL = "udpm://239.255.76.67:7667?ttl=0&recv_buf_size=4194304"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -130,7 +130,7 @@ def write_board(path: Path, board: CharucoBoard) -> str:
     height += _MARGIN  # the ruler and its words
     fits = width <= _PAPER[0] and height <= _PAPER[1]
     page = _PAPER if fits else (width, height)
-    image = Image.new("L", tuple(round(per_metre * side) for side in page), 255)
+    image = Image.new("L", (round(per_metre * page[0]), round(per_metre * page[1])), 255)
     left = round((image.width - board.columns * _PIXELS) / 2)
     top = round(per_metre * _MARGIN)
     image.paste(Image.fromarray(board.draw()), (left, top))

@@ -229,7 +229,7 @@ class _Fit:
         for name in cameras:
             if not any(s.camera == name for s in sights):
                 raise MeasurementError(f"{name}: all its images disagree with the others'")
-        self._X = self._start() if start is None else start._X.copy()
+        self._X: np.ndarray = self._start() if start is None else start._X.copy()
         self._refine()
 
     def X_WC(self, name: str) -> RigidTransform:

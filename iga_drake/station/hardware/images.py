@@ -112,9 +112,9 @@ def decode_intrinsics(message: lcmt_image_array) -> Intrinsics | None:
     name = message.images[0].header.frame_name if message.images else ""
     try:
         values = json.loads(name)
-        return Intrinsics(
-            **{field.name: type(field.default)(values[field.name]) for field in fields(Intrinsics)}
-        )
+        numbers = {field.name: float(values[field.name]) for field in fields(Intrinsics)}
+        width, height = int(numbers.pop("width")), int(numbers.pop("height"))
+        return Intrinsics(width, height, **numbers)
     except (ValueError, KeyError, TypeError):  # a name like any other
         return None
 
