@@ -17,7 +17,6 @@ from PIL import Image
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from iga_drake.cli.options import seed as seed_option
 from iga_drake.drivers.calibration.board import CharucoBoard, opencv
 from iga_drake.drivers.calibration.measurements import BoardSight, hand_poses
 from iga_drake.drivers.calibration.solve import solve_cameras
@@ -297,7 +296,7 @@ def calibration_table(trials: Sequence[CalibrationTrial]) -> str:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("--count", type=int, default=20, help="set-ups of three cameras each")
-    parser.add_argument("--seed", type=seed_option, default=0, help="of the first set-up")
+    parser.add_argument("--seed", type=int, default=0, help="of the first set-up")
     parser.add_argument("--images", type=int, default=15, help="of the board, for each camera")
     parser.add_argument(
         "--mounting", choices=("gripper", "world", "both"), default="both",
@@ -315,6 +314,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Prints the errors of the cameras' poses."""
     check_range(1 <= arguments.count <= 10_000, "--count", arguments.count, "1 to 10000")
+    check_range(0 <= arguments.seed < 2**31, "--seed", arguments.seed, "0 to 2^31 - 1")
     check_range(4 <= arguments.images <= 1000, "--images", arguments.images, "4 to 1000")
     errors = ImageErrors(**{name: getattr(arguments, name) for name in asdict(ImageErrors())})
     mountings = ("gripper", "world") if arguments.mounting == "both" else (arguments.mounting,)

@@ -14,7 +14,6 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from iga_drake.cli.options import seed as seed_option
 from iga_drake.drivers.calibration.arm_shape import ArmShape, ArmShapeLimits, camera_offset
 from iga_drake.errors import check_range
 from iga_drake.progress import progress
@@ -137,7 +136,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("--task", default="grasp", help="whose scenes are rendered")
     parser.add_argument("--count", type=int, default=10, help="scenes, of two postures each")
-    parser.add_argument("--seed", type=seed_option, default=0, help="of the first scene")
+    parser.add_argument("--seed", type=int, default=0, help="of the first scene")
     parser.add_argument(
         "--seen", choices=("primitives", "meshes"), default="primitives",
         help="what the cameras see of the arm",
@@ -158,6 +157,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Prints how often each displacement is noticed."""
     check_range(1 <= arguments.count <= 10_000, "--count", arguments.count, "1 to 10000")
+    check_range(0 <= arguments.seed < 2**31, "--seed", arguments.seed, "0 to 2^31 - 1")
     limits = ArmShapeLimits(arguments.displacement, arguments.met)
     limits.check("--")
     scenario = load_scenario(arguments.task, overrides=[f"panda.visuals={arguments.seen}"])
