@@ -11,7 +11,7 @@ TORCH_BUILD ?= cpu
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 # What the demo needs, and what the tests need besides: extras of pyproject.toml, Debian's packages.
 DEMO_EXTRAS := visuals
-TEST_EXTRAS := $(DEMO_EXTRAS),icp,notebook,meshes,cluster,train,dif-net,geometric,record,lerobot,dev,docs
+TEST_EXTRAS := $(DEMO_EXTRAS),icp,notebook,meshes,cluster,train,dif-net,geometric,record,lerobot,realsense,calibration,dev,docs
 # Some releases add t64 to a package's name.
 DEMO_PACKAGES := libglib2.0-0 libgl1 libegl1 libgl1-mesa-dri libgomp1 python3-venv
 TEST_PACKAGES := $(DEMO_PACKAGES) libusb-1.0-0

@@ -20,6 +20,7 @@ from pip._vendor.packaging.requirements import Requirement
 TORCH_SIZES = {"cpu": (200, 890), "cuda": (2700, 4700)}
 BASE_SIZE = (140, 580)
 EXTRA_SIZES = {
+    "calibration": (55, 175),
     "cluster": (80, 250),
     "dev": (110, 520),
     "dif-net": (10, 20),
@@ -28,6 +29,7 @@ EXTRA_SIZES = {
     "icp": (130, 430),
     "meshes": (35, 65),
     "notebook": (10, 90),
+    "realsense": (15, 38),
     "train": (20, 55),
     "visuals": (140, 440),
 }

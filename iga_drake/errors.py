@@ -56,6 +56,7 @@ _SHORT = _short()
 # Modules of optional packages -> the extra of this project that installs them.
 _EXTRAS = {
     "collada": "visuals",
+    "cv2": "calibration",
     "fast_simplification": "meshes",
     "foxglove_schemas_protobuf": "record",
     "franka": "franka",
@@ -67,6 +68,7 @@ _EXTRAS = {
     "mcap_protobuf": "record",
     "open3d": "icp",
     "pyarrow": "lerobot",
+    "pyrealsense2": "realsense",
     "ray": "cluster",
     "tensorboard": "train",
     "torch_geometric": "geometric",

@@ -16,7 +16,17 @@ README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 README_BYTES = 7000
 # Verbs whose next word names what is done; the others take a scenario.
-VERBS_OF_PARTS = {"benchmark", "dataset", "drive", "evaluate", "export", "shapes", "train", "view"}
+VERBS_OF_PARTS = {
+    "benchmark",
+    "calibrate",
+    "dataset",
+    "drive",
+    "evaluate",
+    "export",
+    "shapes",
+    "train",
+    "view",
+}
 MACHINE_PATH = re.compile(
     r"(?<![\w.~])/(?:data|home|mnt|opt|private|root|scratch|srv|tmp|usr|Users|var|work)/"
 )

@@ -5,7 +5,8 @@ import argparse
 from iga_drake.cli.subcommands import Subcommand, add_subcommands, run_subcommand
 
 SUBCOMMANDS = {
-    "panda": Subcommand("iga_drake.cli.drive_panda", "between LCM and a Panda or an FR3")
+    "panda": Subcommand("iga_drake.cli.drive_panda", "between LCM and a Panda or an FR3"),
+    "realsense": Subcommand("iga_drake.cli.drive_realsense", "RealSense cameras over LCM"),
 }
 
 

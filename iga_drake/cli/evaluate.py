@@ -11,6 +11,9 @@ SUBCOMMANDS = {
         "iga_drake.studies.ablations", "what the parts of the iga aligner are worth",
         "add_ablations", "evaluate_ablations",
     ),
+    "calibration": Subcommand(
+        "iga_drake.studies.calibration", "calibrations of cameras beside their true poses"
+    ),
     "compare": Subcommand(
         "iga_drake.studies.compare", "the paper's model beside the default",
         "add_compare", "evaluate_compare",
@@ -31,6 +34,9 @@ SUBCOMMANDS = {
         "iga_drake.studies.familiarity", "how often own objects are refused, foreign ones accepted"
     ),
     "log": Subcommand("iga_drake.cli.evaluate_log", "poses inferred again from raw logs"),
+    "moved-cameras": Subcommand(
+        "iga_drake.studies.moved_cameras", "displacements of cameras that the arm's shape shows"
+    ),
     "scaling": Subcommand(
         "iga_drake.studies.scaling", "time and memory by number of demonstrations",
         "add_evaluate_scaling", "evaluate_scaling",

@@ -38,9 +38,20 @@ class CameraCalibration:
         return RigidTransform(RollPitchYaw(self.pose.rpy), self.pose.translation)
 
 
-def write_calibration(path: Path, calibration: CameraCalibration) -> None:
-    """Writes the file whole or not at all."""
-    write_text(path, yaml_dump_typed(calibration, schema=CameraCalibration))
+def write_calibration(path: Path, calibration: CameraCalibration, *, about: str = "") -> None:
+    """Writes the file whole or not at all, the lines of `about` as comments above."""
+    comment = "".join(f"# {line}\n" for line in about.splitlines())
+    write_text(path, comment + yaml_dump_typed(calibration, schema=CameraCalibration))
+
+
+def differing_intrinsic(found: Intrinsics, wanted: Intrinsics) -> str:
+    """Name of the first field by which two cameras' intrinsics differ; empty where they agree to
+    half a pixel."""
+    given = asdict(found)
+    for name, value in asdict(wanted).items():
+        if not abs(given[name] - value) <= _SAME:
+            return name
+    return ""
 
 
 def read_calibration(
@@ -92,11 +103,10 @@ def read_calibration(
         raise CalibrationFileError(
             f"{path}: the camera would stand at {values[:3]} m of the robot's base: {remedy}"
         )
-    wanted, given = asdict(intrinsics), asdict(found.intrinsics)
-    for name, value in wanted.items():
-        if not abs(given[name] - value) <= _SAME:
-            raise CalibrationFileError(
-                f"{path}: intrinsics.{name} is {given[name]:g}, the scenario says {value:g}: state "
-                f"the camera's own in the scenario, or {remedy}"
-            )
+    name = differing_intrinsic(found.intrinsics, intrinsics)
+    if name:
+        raise CalibrationFileError(
+            f"{path}: intrinsics.{name} is {getattr(found.intrinsics, name):g}, the scenario says "
+            f"{getattr(intrinsics, name):g}: state the camera's own in the scenario, or {remedy}"
+        )
     return found

@@ -1,7 +1,14 @@
-"""Images over LCM: `lcmt_image_array` to the port contract's images and back."""
+"""Images over LCM: `lcmt_image_array` to the port contract's images and back.
 
+The message has no field for intrinsics. Each image's `header.frame_name` holds them, as a JSON
+object with the fields of `Intrinsics`; other senders may leave the name as they like.
+`header.seq` is the camera's frame number.
+"""
+
+import json
 import zlib
 from collections.abc import Callable
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -13,6 +20,7 @@ from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
 
 from iga_drake.station.cameras.rgbd import Intrinsics
 from iga_drake.station.contract import StationError
+from iga_drake.station.hardware.calibration import differing_intrinsic
 from iga_drake.station.lcm import Clock, utime_of, wall_clock
 
 # The channel of a camera is this and its name, as in Drake's `CameraConfig`.
@@ -33,6 +41,13 @@ _TYPES: dict[int, np.dtype] = {
     lcmt_image.CHANNEL_TYPE_UINT16: np.dtype("u2"),
     lcmt_image.CHANNEL_TYPE_FLOAT32: np.dtype("f4"),
 }
+_PIXELS = {
+    ("color", 3): lcmt_image.PIXEL_FORMAT_RGB,
+    ("color", 4): lcmt_image.PIXEL_FORMAT_RGBA,
+    ("depth", 1): lcmt_image.PIXEL_FORMAT_DEPTH,
+    ("label", 1): lcmt_image.PIXEL_FORMAT_LABEL,
+}
+_CHANNELS = {dtype.str[1:]: number for number, dtype in _TYPES.items()}
 _WANTED = {"color": ("u1",), "depth": ("f4", "u2"), "label": ("i2",)}
 
 
@@ -92,22 +107,46 @@ def _pixels(image: lcmt_image, pixel: np.dtype, channels: int, camera: str) -> n
     return pixels
 
 
-def encode_images(images: dict[str, np.ndarray], *, utime: int) -> lcmt_image_array:
-    """The message of images as `decode_images` returns them, compressed by zlib."""
-    formats = {
-        "color": (lcmt_image.PIXEL_FORMAT_RGBA, lcmt_image.CHANNEL_TYPE_UINT8),
-        "depth": (lcmt_image.PIXEL_FORMAT_DEPTH, lcmt_image.CHANNEL_TYPE_FLOAT32),
-        "label": (lcmt_image.PIXEL_FORMAT_LABEL, lcmt_image.CHANNEL_TYPE_INT16),
-    }
+def decode_intrinsics(message: lcmt_image_array) -> Intrinsics | None:
+    """The intrinsics that the sender told with its first image; None where it told none."""
+    name = message.images[0].header.frame_name if message.images else ""
+    try:
+        values = json.loads(name)
+        numbers = {field.name: float(values[field.name]) for field in fields(Intrinsics)}
+        width, height = int(numbers.pop("width")), int(numbers.pop("height"))
+        return Intrinsics(width, height, **numbers)
+    except (ValueError, KeyError, TypeError):  # a name like any other
+        return None
+
+
+def encode_images(
+    images: dict[str, np.ndarray],
+    *,
+    utime: int,
+    intrinsics: Intrinsics | None = None,
+    number: int = 0,
+) -> lcmt_image_array:
+    """The message of images, compressed by zlib.
+
+    Args:
+      images: as `decode_images` returns them; colour may be RGB without A, depth may be uint16 mm.
+      utime: when they were taken, in microseconds since 1970.
+      intrinsics: of all of them; None: not told.
+      number: the camera's frame number.
+    """
     message = lcmt_image_array()
     message.header = lcmt_header()
     message.header.utime = utime
+    message.header.seq = number & 0x7FFFFFFF
+    if intrinsics is not None:
+        message.header.frame_name = json.dumps(asdict(intrinsics))
     for kind, pixels in images.items():
         image = lcmt_image()
         image.header = message.header
         image.height, image.width, channels = pixels.shape
         image.row_stride = image.width * channels * pixels.itemsize
-        image.pixel_format, image.channel_type = formats[kind]
+        image.pixel_format = _PIXELS[kind, channels]
+        image.channel_type = _CHANNELS[pixels.dtype.str[1:]]
         image.compression_method = lcmt_image.COMPRESSION_METHOD_ZLIB
         image.data = zlib.compress(np.ascontiguousarray(pixels).tobytes(), level=1)
         image.size = len(image.data)
@@ -136,14 +175,16 @@ class ImageReceiver(LeafSystem):
     - `label_image`: the labels in the message; where it has none, all is background.
     - `time` (1, s): the message's stamp on the diagram's clock; NaN before there is a message.
 
-    Images before the first message are empty: no depth. A message without depth, or that can't be
-    read, raises `StationError` where its images are asked for.
+    Images before the first message are empty: no depth. A message without depth, that tells
+    another focal length or principal point than the scenario's, or that can't be read, raises
+    `StationError` where its images are asked for.
     """
 
     def __init__(self, camera: str, intrinsics: Intrinsics) -> None:
         super().__init__()
         self.set_name(f"{camera}.images")
         self._camera, self._size = camera, (intrinsics.height, intrinsics.width)
+        self._intrinsics = intrinsics
         self._images_input = self.DeclareAbstractInputPort("images", Value(lcmt_image_array()))
         self._offset_input = self.DeclareVectorInputPort("clock_offset", 1)
         decoded = self.DeclareCacheEntry(
@@ -179,6 +220,14 @@ class ImageReceiver(LeafSystem):
         images = decode_images(message, self._camera)
         if message.num_images and "depth" not in images:
             raise StationError(f"{self._camera}: its messages have no depth image: send it as well")
+        told = decode_intrinsics(message)
+        name = "" if told is None else differing_intrinsic(told, self._intrinsics)
+        if name not in ("", "width", "height"):  # those who use images see their size
+            raise StationError(
+                f"{self._camera}: its images have intrinsics.{name} {getattr(told, name):g}, the "
+                f"scenario says {getattr(self._intrinsics, name):g}: state the camera's own in the "
+                "scenario, or start its driver with the scenario's size"
+            )
         output.set_value(images)
 
     def _calc_time(self, context: Context, output: BasicVector) -> None:
@@ -213,6 +262,7 @@ class ImageSender(LeafSystem):
         super().__init__()
         self.set_name(f"{camera}.sender")
         self._channel, self._lcm, self._clock = f"{CHANNEL}{camera}", lcm, clock
+        self._intrinsics = intrinsics
         size = intrinsics.width, intrinsics.height
         self._inputs = {
             name: self.DeclareAbstractInputPort(f"{name}_image", Value(kind(*size)))
@@ -228,6 +278,7 @@ class ImageSender(LeafSystem):
 
     def _publish(self, context: Context) -> EventStatus:
         images = {name: port.Eval(context).data for name, port in self._inputs.items()}
-        message = encode_images(images, utime=utime_of(self._clock(context)))
+        utime = utime_of(self._clock(context))
+        message = encode_images(images, utime=utime, intrinsics=self._intrinsics)
         self.send(context, self._channel, message.encode())
         return EventStatus.Succeeded()
