@@ -37,6 +37,7 @@ _OUTSIDE = {
 COMMANDS = {
     "simulate": "run one episode of a scenario",
     "demonstrate": "let the scripted expert record demonstrations",
+    "teach": "show a task yourself: jog the hand on a page, record waypoints",
     "drive": "drivers beside the hardware: the Panda",
     "view": "look at demonstrations, shapes, samples, deformations",
     "evaluate": "tasks, alignments and where their errors come from, deformations",

@@ -139,8 +139,7 @@ class Jog(LeafSystem):
         status = self._judge(jogged, goal, X_WE)
         if self._meets_contact(jogged, goal, force):
             status = replace(status, touched=True, sequence_reached=goal.sequence)
-            still = {"linear": np.zeros(3), "angular": np.zeros(3)}
-            return replace(jogged, X_WDesired=X_WE, status=status, **still)
+            return _rested(jogged, X_WE, status)
         way = goal.X_WE.translation() - desired.translation()
         turn = (goal.X_WE.rotation() @ desired.rotation().inverse()).ToAngleAxis()
         rotation = turn.angle() * turn.axis()
@@ -152,8 +151,7 @@ class Jog(LeafSystem):
         share = min(1.0, math.sqrt(left / config.ramp))
         waits = max(pose_error(desired, X_WE)) > _LEAD
         if not waits and left <= share * config.period:
-            still = {"linear": np.zeros(3), "angular": np.zeros(3)}
-            return replace(jogged, X_WDesired=goal.X_WE, status=status, **still)
+            return _rested(jogged, goal.X_WE, status)
         rate = 0.0 if waits else share / left
         step = config.period / config.ramp
         linear = _slewed(jogged.linear, rate * way, config.linear_speed * step)
@@ -166,9 +164,7 @@ class Jog(LeafSystem):
             RotationMatrix.ProjectToRotationMatrix(R.matrix()),
             desired.translation() + linear * config.period,
         )
-        return replace(
-            jogged, X_WDesired=X_WDesired, linear=linear, angular=angular, status=status
-        )
+        return replace(jogged, X_WDesired=X_WDesired, linear=linear, angular=angular, status=status)
 
     def _judge(self, jogged: _Jogged, goal: JogGoal, X_WE: RigidTransform) -> FollowerStatus:
         """What is left of the way, and whether the goal is reached."""
@@ -207,6 +203,13 @@ class Jog(LeafSystem):
 
     def _calc_status(self, context: Context, output: AbstractValue) -> None:
         output.set_value(self._read(context).status)
+
+
+def _rested(jogged: _Jogged, X_WDesired: RigidTransform, status: FollowerStatus) -> _Jogged:
+    """At rest at a pose."""
+    return replace(
+        jogged, X_WDesired=X_WDesired, status=status, linear=np.zeros(3), angular=np.zeros(3)
+    )
 
 
 def _slewed(value: np.ndarray, wanted: np.ndarray, step: float) -> np.ndarray:

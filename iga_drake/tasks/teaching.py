@@ -67,6 +67,7 @@ _MOVED = (0.002, math.radians(1.0))  # m, rad that a still hand may move meanwhi
 CONTACT_FORCE = 15.0  # N against the hand's motion at which it ends
 # m, rad within which the hand still is at a waypoint: what it is told there is the waypoint's.
 _AT_WAYPOINT = (0.01, math.radians(5.0))
+_GUIDED = (ArmMode.GUIDING, ArmMode.IDLE)  # modes in which a person may move the arm
 _AFTER = 3.0  # s for which the world goes on after a replay, before it is judged
 
 
@@ -241,7 +242,7 @@ class TeachingSession:
         if reason := check_workspace(self.pose, self._workspace):
             return f"the hand {reason}"
         if self.guided:
-            return ""
+            return "" if self.mode in _GUIDED else self.mode.problem
         status: SupervisorStatus = self._eval("supervisor", "status")
         return f"the arm is held: {status.reason}" if status.holding else ""
 
@@ -249,6 +250,22 @@ class TeachingSession:
     def _workspace(self) -> tuple[np.ndarray, np.ndarray]:
         limits = self.scenario.supervisor
         return np.array(limits.workspace_lower), np.array(limits.workspace_upper)
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Whether the task is done by now; None where nobody knows the truth."""
+        if self._judge is None:
+            return None
+        try:
+            return self._judge(self._snapshots)
+        except TaskError as error:
+            return Verdict(False, str(error))
+
+    @property
+    def snapshots(self) -> tuple[Snapshot, ...]:
+        """The true states so far, one a tick, but for what was taken back; empty where nobody knows
+        the truth."""
+        return tuple(self._snapshots)
 
     def clouds(self) -> dict[str, np.ndarray]:
         """What the cameras see now, points (P, 3) (m, in W) by role: "target" and "grasped"."""
@@ -296,7 +313,7 @@ class TeachingSession:
     def advance(self, duration: float = TICK) -> None:
         """Goes on for `duration` (s), rounded to whole ticks of `TICK`."""
         for _ in range(max(1, round(duration / TICK))):
-            self.simulator.AdvanceTo(self.time + TICK)
+            self.simulator.AdvanceTo(TICK * (round(self.time / TICK) + 1))
             self._follow_the_arm()
             if self._read_truth is not None:
                 self._snapshots.append(self._read_truth(self.simulator.get_context()))
@@ -641,18 +658,21 @@ class TeachingSession:
                 if target.settle:
                     self.advance(target.settle)
 
+    @property
+    def trajectory(self) -> Trajectory | None:
+        """The way of the hand so far, but for replays and what was taken back; None before the
+        first sample."""
+        if not self._samples:
+            return None
+        times, poses, openings = zip(*self._samples, strict=True)
+        return Trajectory(times=np.array(times), X_WE=np.stack(poses), openings=np.array(openings))
+
     def _demonstration(self, waypoints: tuple[Waypoint, ...]) -> Demonstration:
         used = {name for w in waypoints for name in (w.grasped, w.target)}
-        trajectory = None
-        if self._samples:
-            times, poses, openings = zip(*self._samples, strict=True)
-            trajectory = Trajectory(
-                times=np.array(times), X_WE=np.stack(poses), openings=np.array(openings)
-            )
         return Demonstration(
             observations={n: o for n, o in self._observations.items() if n in used},
             waypoints=waypoints,
-            trajectory=trajectory,
+            trajectory=self.trajectory,
             provenance=self._provenance,
         )
 
@@ -704,8 +724,6 @@ def begin_teaching(
         motion=task.motion,
         provenance=provenance,
         restores=True,
-        read_truth=lambda context: read_snapshot(
-            plant, plant.GetMyContextFromRoot(context), panda
-        ),
+        read_truth=lambda context: read_snapshot(plant, plant.GetMyContextFromRoot(context), panda),
         judge=lambda snapshots: task.success(scene, snapshots),
     )
