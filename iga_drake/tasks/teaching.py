@@ -146,9 +146,8 @@ class TeachingSession:
         }
         self._diagram = self._build()
         self.simulator = Simulator(self._diagram)
+        self._send(JogGoal(opening=motion.waypoints[0].opening_approach))
         self.simulator.Initialize()
-        self._goal = JogGoal(opening=motion.waypoints[0].opening_approach)
-        self._send(self._goal)
         self._observations: dict[str, Observation] = {}
         self._waypoints: tuple[Waypoint, ...] = ()
         self._samples: list[tuple[float, np.ndarray, float]] = []
@@ -528,6 +527,10 @@ class TeachingSession:
         X_WE = self.pose
         if not np.isfinite(X_WE.GetAsMatrix34()).all():
             raise TeachingError(self.warning)
+        if self.moving:
+            raise TeachingError(
+                f"waypoint '{following.name}': the hand is on its way: wait, or stop it"
+            )
         if reason := check_workspace(X_WE, self._workspace):
             raise TeachingError(f"waypoint '{following.name}': the hand {reason}")
         waypoint = Waypoint(
@@ -558,8 +561,8 @@ class TeachingSession:
             return
         self._samples, self._snapshots = list(moment.samples), list(moment.snapshots)
         self.simulator.reset_context(moment.context.Clone())
-        self.simulator.Initialize()
         self._send(moment.goal)
+        self.simulator.Initialize()
 
     def undo(self) -> str:
         """Takes back the last waypoint and returns its name. In simulation everything is as it was

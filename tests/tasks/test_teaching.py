@@ -111,6 +111,9 @@ def test_what_cannot_be_recorded_is_refused_and_changes_nothing():
     session.look()
     session.go(above_ball(0.6))
     refused(session.record, "0.5", "away from 'pan'")  # the hand is far above
+    session.move_to(above_ball(0.12))
+    session.advance()
+    refused(session.record, "the hand is on its way")
     assert session.waypoints == () and set(session.observations) == {"pan", "gripper"}
     session.go(above_ball(0.12))
     session.record()
