@@ -4,6 +4,7 @@ With IGA_PICTURES=DIR the picture of the documentation is written there.
 """
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from browser import Browser, needs_browser
@@ -16,6 +17,15 @@ from iga_drake.tasks.teaching import TeachingSession, begin_teaching
 from iga_drake.tasks.teaching_loop import TeachingLoop
 from iga_drake.viewing.meshcat import start_meshcat
 from iga_drake.viewing.teaching_panel import TeachingAction, TeachingPanel
+
+
+def tick_until(loop: TeachingLoop, done: Callable[[], bool]) -> None:
+    """Serves the page until something asked for there is done."""
+    for _ in range(200):
+        if done():
+            return
+        loop.tick()
+    raise AssertionError("the page's key is not heeded")
 
 
 @needs_browser
@@ -41,12 +51,11 @@ def test_a_waypoint_is_taught_from_the_page(tmp_path: Path):
     with Browser(tmp_path / "page", width=1280, height=720) as browser:
         browser.open(meshcat.web_url())
         browser.wait_for("typeof viewer == 'object' && viewer.scene_tree.children.drake", 240.0)
+        browser.wait_for("document.body.innerText.includes('record waypoint')", 240.0)
         browser.press("KeyR")
-        while not session.complete:
-            loop.tick()
+        tick_until(loop, lambda: session.complete)
         browser.press("KeyP")
-        while not meshcat.HasPath("/drake/teaching/way/line"):
-            loop.tick()
+        tick_until(loop, lambda: meshcat.HasPath("/drake/teaching/way/line"))
         session.go(above)
         loop.tick()
         text = ["Cameras", "default", "rotated", "<object>", "text"]
@@ -56,5 +65,7 @@ def test_a_waypoint_is_taught_from_the_page(tmp_path: Path):
         words = browser.evaluate("document.body.innerText")
         for control in ("x (m)", "yaw (deg)", "opening (m)", *TeachingAction):
             assert control in words, control
+        browser.evaluate("Object.values(viewer.gui.__folders).map(f => f.close()).length")
+        browser.evaluate("viewer.gui.open(), 0")
         browser.picture(pictures / "teach.jpg", **JPEG)
         assert browser.errors == []
