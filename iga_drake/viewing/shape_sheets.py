@@ -13,11 +13,9 @@ from pydrake.geometry import (
     GeometryInstance,
     InMemoryMesh,
     LightParameter,
-    MakeRenderEngineVtk,
     Mesh,
     PerceptionProperties,
     RenderCameraCore,
-    RenderEngineVtkParams,
     RenderLabel,
     SceneGraph,
 )
@@ -27,6 +25,7 @@ from pydrake.systems.sensors import CameraInfo, ImageIo, ImageRgb8U
 from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.families import FAMILIES
 from iga_drake.shapes.instance import ShapeInstance
+from iga_drake.viewing.rendering import headless_renderer
 
 # One light tint a part label, in turn.
 TINTS = (
@@ -218,8 +217,7 @@ def _render(document: bytes, *, columns: int, rows: int, tile_px: int) -> np.nda
         LightParameter(type="directional", frame="camera", direction=direction, intensity=intensity)
         for direction, intensity in zip(_LIGHTS, (2.0, 1.0, 1.2), strict=True)
     ]
-    params = RenderEngineVtkParams(default_clear_color=[1, 1, 1], lights=lights, backend="EGL")
-    scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(params))
+    scene_graph.AddRenderer("vtk", headless_renderer(default_clear_color=[1, 1, 1], lights=lights))
     geometry = GeometryInstance(
         RigidTransform(),
         Mesh(InMemoryMesh(mesh_file=MemoryFile(document, ".gltf", "sheet"))),

@@ -11,9 +11,7 @@ from pydrake.geometry import (
     DepthRange,
     DepthRenderCamera,
     LightParameter,
-    MakeRenderEngineVtk,
     RenderCameraCore,
-    RenderEngineVtkParams,
     SceneGraph,
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
@@ -24,6 +22,7 @@ from pydrake.systems.sensors import CameraInfo, RgbdSensor
 from iga_drake.dataset.depth_noise import DepthNoise
 from iga_drake.errors import check_bounds, check_range
 from iga_drake.station.cameras.noise import CalibrationError, CameraNoise, calibration_error
+from iga_drake.viewing.rendering import headless_renderer
 
 RENDERER = "vtk"
 _CLIPPING = (0.01, 10.0)  # m, of the renderer
@@ -210,8 +209,11 @@ def rendering_info(intrinsics: Intrinsics) -> CameraInfo:
 
 
 def add_renderer(scene_graph: SceneGraph) -> None:
-    """Adds the renderer that all cameras share; it needs no display."""
-    params = RenderEngineVtkParams(
+    """Adds the renderer that all cameras share; it needs no display.
+
+    Raises `RenderingError` where there is no EGL to render with.
+    """
+    renderer = headless_renderer(
         default_clear_color=[0.85, 0.87, 0.9],
         lights=[
             LightParameter(
@@ -221,9 +223,8 @@ def add_renderer(scene_graph: SceneGraph) -> None:
                 type="directional", frame="camera", direction=[0.0, 0.0, 1.0], intensity=0.6
             ),
         ],
-        backend="EGL",
     )
-    scene_graph.AddRenderer(RENDERER, MakeRenderEngineVtk(params))
+    scene_graph.AddRenderer(RENDERER, renderer)
 
 
 CAMERAS = {"rgbd": RgbdCamera}
