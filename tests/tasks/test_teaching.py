@@ -56,6 +56,12 @@ class Taught:
         return float(port.Eval(self.station.GetMyContextFromRoot(context))[0])
 
 
+def samples_of(session: TeachingSession) -> np.ndarray:
+    """Times (K,) of the trajectory so far."""
+    assert session.trajectory is not None
+    return session.trajectory.times
+
+
 def teach(session: TeachingSession, height: float = 0.12) -> None:
     session.look()
     assert session.go(above_ball(height))
@@ -69,7 +75,8 @@ def test_what_is_recorded_is_what_was_seen_and_where_the_hand_was(tmp_path):
     assert session.look() == ("gripper", "pan")
     assert session.missing == ()
     assert session.go(above_ball(0.12))
-    assert session.next_waypoint.name == "grasp" and not session.complete
+    following = session.next_waypoint
+    assert following is not None and following.name == "grasp" and not session.complete
     session.record()
     session.toggle_hand()  # at the waypoint, so it is the waypoint's
     session.go(above_ball(0.2))
@@ -135,14 +142,14 @@ def test_undo_takes_the_world_back_to_where_the_waypoint_was_recorded():
     session = Taught().session
     session.look()
     session.go(above_ball(0.12))
-    time, pose, samples = session.time, session.pose, len(session.trajectory.times)
+    time, pose, samples = session.time, session.pose, len(samples_of(session))
     session.record()
     session.toggle_hand()
     session.go(above_ball(0.3))
     assert session.undo() == "grasp"
     assert session.waypoints == () and session.opening == 0.08
     assert session.time == time and session.pose.IsNearlyEqualTo(pose, 1e-12)
-    assert len(session.trajectory.times) == samples
+    assert len(samples_of(session)) == samples
     session.advance(0.5)
     assert session.pose.IsNearlyEqualTo(pose, 1e-3)  # its goal is that of then as well
     session.record()
@@ -169,7 +176,7 @@ def test_a_replay_goes_the_policys_way_and_what_was_taught_stays(restores: bool)
     session = Taught(restores=restores).session
     teach(session)
     session.go(above_ball(0.3))
-    before = session.demonstration()
+    before, times = session.demonstration(), samples_of(session)
     way: list[tuple[np.ndarray, float]] = []
 
     def watch() -> bool:
@@ -190,7 +197,7 @@ def test_a_replay_goes_the_policys_way_and_what_was_taught_stays(restores: bool)
     np.testing.assert_array_equal(after.waypoints[0].X_WE, before.waypoints[0].X_WE)
     assert after.waypoints[0].opening == 0.0
     if restores:
-        np.testing.assert_array_equal(after.trajectory.times, before.trajectory.times)
+        np.testing.assert_array_equal(samples_of(session), times)
         assert session.time == time and session.pose.IsNearlyEqualTo(pose, 1e-9)
 
 
