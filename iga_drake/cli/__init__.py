@@ -39,6 +39,7 @@ COMMANDS = {
     "rehearse": "run one through LCM and the hardware station, on a simulated cell",
     "run": "run one on the arm",
     "demonstrate": "let the scripted expert record demonstrations",
+    "teach": "show a task yourself: jog the hand on a page, record waypoints",
     "drive": "drivers beside the hardware: the Panda, RealSense cameras",
     "calibrate": "measure where cameras stand, and whether they still do",
     "view": "look at demonstrations, logs, shapes, samples, deformations",

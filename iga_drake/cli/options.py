@@ -1,6 +1,7 @@
 """Options that several commands share."""
 
 import argparse
+import math
 from collections.abc import Collection
 from typing import Any
 
@@ -14,6 +15,14 @@ def seed(text: str) -> int:
     number = int(text)
     if not 0 <= number < 2**31:
         raise argparse.ArgumentTypeError(f"{number} found, an integer from 0 to 2^31 - 1 expected")
+    return number
+
+
+def seconds(text: str) -> float:
+    """A finite number from 0 on, as argparse takes it."""
+    number = float(text)
+    if not 0.0 <= number < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} found, a number from 0 on expected")
     return number
 
 

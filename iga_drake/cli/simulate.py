@@ -2,14 +2,13 @@
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from iga_drake.cli.options import add_aligner_options, aligner_options, seed
+from iga_drake.cli.options import add_aligner_options, aligner_options, seconds, seed
 from iga_drake.cli.recording import add_record_arguments, log_request, tell_of_log
 from iga_drake.cli.scenarios import (
     add_demonstrations_argument,
@@ -48,12 +47,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="show in a browser what the robot does, sees, infers and is about to do",
     )  # fmt: skip
     parser.add_argument(
-        "--wait", type=_seconds, metavar="SECONDS",
+        "--wait", type=seconds, metavar="SECONDS",
         help="with --meshcat: wait so long for a browser before the start (default 60 in a "
         "terminal, else 0)",
     )  # fmt: skip
     parser.add_argument(
-        "--realtime", type=_seconds, metavar="RATE",
+        "--realtime", type=seconds, metavar="RATE",
         help="with --meshcat: simulated seconds in a second at most, 0 for as many as can be "
         "(default 1 in a terminal, else 0)",
     )  # fmt: skip
@@ -197,11 +196,3 @@ def _pacer(simulator: "Simulator", buttons: "RunButtons", rate: float | None) ->
         return goes_on
 
     return proceed
-
-
-def _seconds(text: str) -> float:
-    """A finite number from 0 on, as argparse takes it."""
-    number = float(text)
-    if not 0.0 <= number < math.inf:
-        raise argparse.ArgumentTypeError(f"{text} found, a number from 0 on expected")
-    return number

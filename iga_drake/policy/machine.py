@@ -34,6 +34,7 @@ from iga_drake.policy.motion import (
     Refusal,
     TaskMotion,
     Workspace,
+    check_cameras,
     check_observation,
     check_workspace,
     choose_reachable,
@@ -360,7 +361,7 @@ class PolicyMachine:
         if now < memory.observe_next:
             return memory
         try:
-            self._check_cameras(inputs.cameras())
+            check_cameras(inputs.cameras(), self.config.minimum_cameras)
             points = check_observation(
                 inputs.cloud(plan.role),
                 plan.name,
@@ -378,17 +379,6 @@ class PolicyMachine:
             points = (inputs.pose().inverse() @ points.T).T
         memory = self._note(memory, inputs, now, plan, points)
         return self._continue(memory, inputs, now, f"{plan.name} {len(points)} points")
-
-    def _check_cameras(self, cameras: Mapping[str, CameraCounts]) -> None:
-        """Raises `Refusal` where a camera is wrong that may not be left out."""
-        wrong = {name: counts.problem for name, counts in cameras.items() if counts.problem}
-        least = self.config.minimum_cameras
-        good = len(cameras) - len(wrong)
-        if wrong and (least is None or good < least):
-            reason = "; ".join(f"{name} {why}" for name, why in wrong.items())
-            if least is not None:
-                reason += f" ({good} of {len(cameras)} cameras are left, {least} are needed)"
-            raise Refusal(reason, Cause.PERCEPTION)
 
     def _start_present(
         self, memory: PolicyMemory, plan: ObservationPlan, now: float, detail: str

@@ -5,7 +5,7 @@ Everything here is a plain function or a frozen value, so that it can be tested 
 
 import math
 import time as wall
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -15,6 +15,7 @@ from pydrake.math import RigidTransform
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.demonstrations.demonstration import Frame, ObservedRole
 from iga_drake.errors import IgaDrakeError
+from iga_drake.systems.fusion import CameraCounts
 from iga_drake.systems.messages import Cause, EndEffectorTarget
 
 
@@ -262,6 +263,18 @@ def moved_steps(
     return tuple(
         replace(step, target=replace(step.target, X_WE=X_WW @ step.target.X_WE)) for step in steps
     )
+
+
+def check_cameras(cameras: Mapping[str, CameraCounts], minimum: int | None) -> None:
+    """Raises `Refusal` where a camera is wrong that may not be left out: any of them, or, with a
+    `minimum`, one of so many that fewer are left."""
+    wrong = {name: counts.problem for name, counts in cameras.items() if counts.problem}
+    good = len(cameras) - len(wrong)
+    if wrong and (minimum is None or good < minimum):
+        reason = "; ".join(f"{name} {why}" for name, why in wrong.items())
+        if minimum is not None:
+            reason += f" ({good} of {len(cameras)} cameras are left, {minimum} are needed)"
+        raise Refusal(reason, Cause.PERCEPTION)
 
 
 def check_observation(

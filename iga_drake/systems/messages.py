@@ -48,8 +48,24 @@ NO_TARGET = EndEffectorTarget(
 
 
 @dataclass(frozen=True)
+class JogGoal:
+    """Where a person puts the hand's goal, and how far the hand is open meanwhile."""
+
+    # Rises by one with every new goal.
+    sequence: int = 0
+    # Goal of the end-effector frame E in the world (= base) frame; None: the hand stays.
+    X_WE: RigidTransform | None = None
+    # Opening of the hand (m).
+    opening: float = 0.0
+    # External force (N) against the motion at which it ends; None: it goes on against any.
+    contact_force: float | None = 15.0
+    # Scales the speed of the motion, in (0, 1].
+    speed_scale: float = 1.0
+
+
+@dataclass(frozen=True)
 class FollowerStatus:
-    """The waypoint follower's report: the last target it finished and the distance left."""
+    """What a follower of targets or goals reports: the last one finished and the distance left."""
 
     # The last target whose pose was reached and whose settling time is over (0: none).
     sequence_reached: int = 0

@@ -188,13 +188,13 @@ class PredictedPoses(_View):
             color = OTHER_MODE_COLOR
             color = Rgba(color.r(), color.g(), color.b(), 0.25 + 0.5 * share / best)
             X_WE = RigidTransform(estimate.poses[mode])
-            _show_hand(self._meshcat, f"{self._path}/{name}/modes/{words}", X_WE, color)
+            show_hand(self._meshcat, f"{self._path}/{name}/modes/{words}", X_WE, color)
         self._appear(context, name, "modes")
 
     def _show_chosen(self, context: Context, index: int, pose: ReachablePose) -> None:
         waypoint = self._motion.waypoints[index]
         path = f"{self._path}/{waypoint.name}/chosen"
-        _show_hand(self._meshcat, f"{path}/hand", pose.X_WE, PREDICTED_COLOR)
+        show_hand(self._meshcat, f"{path}/hand", pose.X_WE, PREDICTED_COLOR)
         grasped = self._read(context, "observations").get(waypoint.grasped)
         if grasped is not None and grasped.role != "gripper":
             points = (pose.X_WE @ grasped.points.T).T
@@ -411,7 +411,7 @@ def show_demonstrated(
             if demonstration.observations[waypoint.grasped].role != "gripper":
                 points = alignment.grasped[::3]
                 show_cloud(meshcat, f"{at}/{waypoint.grasped}", points, GRASPED_COLOR)
-            _show_hand(meshcat, f"{at}/hand", RigidTransform(waypoint.X_WE), _FRUSTUM_COLOR)
+            show_hand(meshcat, f"{at}/hand", RigidTransform(waypoint.X_WE), _FRUSTUM_COLOR)
             slot = _SHELF.copy()
             slot[1:] += _SHELF_SPACING * [index - (len(demonstrations) - 1) / 2, k]
             matrix = np.diag([_SHELF_SCALE] * 3 + [1.0])
@@ -431,7 +431,7 @@ def show_verdict(
     expert's X_WE."""
     meshcat.Delete(path)
     for name, X_WE in experts.items():
-        _show_hand(meshcat, f"{path}/{name}", X_WE, EXPERT_COLOR)
+        show_hand(meshcat, f"{path}/{name}", X_WE, EXPERT_COLOR)
         show(meshcat, f"{path}/{name}", time)
     show_text(meshcat, words.splitlines())
 
@@ -498,7 +498,8 @@ def _hand_mesh() -> tuple[np.ndarray, np.ndarray]:
     return np.vstack(vertices).T, np.vstack(faces).T.astype(np.int32)
 
 
-def _show_hand(meshcat: Meshcat, path: str, X_WE: RigidTransform, color: Rgba) -> None:
+def show_hand(meshcat: Meshcat, path: str, X_WE: RigidTransform, color: Rgba) -> None:
+    """Shows a hand made of four boxes at a pose."""
     meshcat.SetTriangleMesh(path, *_hand_mesh(), color)
     for channel in "rgb":  # so that its colour is told from the sides that no light reaches
         glow = _GLOW * getattr(color, channel)()

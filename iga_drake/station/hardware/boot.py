@@ -20,6 +20,8 @@ from iga_drake.systems.ports import PANDA_JOINTS, ArmMode
 _STATUSES = 5  # whose mean is taken
 _SPREAD = 0.01  # rad, largest difference among them
 _HAND_AGE = 0.5  # s
+# Modes in which an arm that is only measured may be.
+_GUIDED = (ArmMode.GUIDING, ArmMode.IDLE, ArmMode.USER_STOPPED)
 _WIDTH_TOLERANCE = 0.002  # m
 
 
@@ -87,7 +89,8 @@ def _check_arm(statuses: list[lcmt_panda_status], driver: PandaDriver, now: floa
             f"{driver.expiry:g} s allowed: set both machines' clocks (chrony), restart the driver"
         )
     mode = messages.arm_mode(last)
-    if mode is not ArmMode.READY:
+    guided = driver.control_mode == "status_only" and mode in _GUIDED
+    if mode is not ArmMode.READY and not guided:
         raise StationError(f"{channel}: {mode.problem}")
     wanted = messages.CONTROL_MODES[driver.control_mode]
     if last.control_mode not in (0, wanted):  # drake-franka-driver always sends 0

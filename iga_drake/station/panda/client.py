@@ -95,7 +95,9 @@ class PandaClient(LeafSystem):
     Sending ends for good where the arm isn't `ArmMode.READY`, its last status is older than the
     commands' `expiry`, it is further than `tracking_error` from the command, or the command isn't
     finite: the driver then holds the arm, and it can't jump when it is ready again. The arm counts
-    as `ArmMode.IGNORES_COMMANDS` where its desired position isn't what was sent.
+    as `ArmMode.IGNORES_COMMANDS` where its desired position isn't what was sent. In the control
+    mode "status_only" the arm is never sent a command, and the hand is whatever the arm's mode is;
+    an arm that says it is ready is `ArmMode.IDLE` then.
     """
 
     def __init__(
@@ -114,6 +116,7 @@ class PandaClient(LeafSystem):
         check_range(period <= most, "control.period", period, f"up to {most:g} s, half the expiry")
         self.set_name("PandaClient")
         self._driver, self._lcm, self._period, self._clock = driver, lcm, period, clock
+        self._only_measures = driver.control_mode == "status_only"
         self._position_input = self.DeclareVectorInputPort("panda.position", PANDA_JOINTS)
         self._opening_input = self.DeclareVectorInputPort("hand.opening", 1)
         self._status_input = self.DeclareAbstractInputPort("status", Value(lcmt_panda_status()))
@@ -198,6 +201,8 @@ class PandaClient(LeafSystem):
             ).all():
                 strikes = link.strikes + 1
         mode = messages.arm_mode(status)
+        if mode is ArmMode.READY and self._only_measures:
+            mode = ArmMode.IDLE
         if mode is ArmMode.READY and strikes >= _STRIKES:
             mode = ArmMode.IGNORES_COMMANDS
         return replace(
@@ -232,7 +237,7 @@ class PandaClient(LeafSystem):
     def _send_arm(self, context: Context) -> EventStatus:
         link = self._read(context)
         command = np.array(self._position_input.Eval(context))
-        if link.ended or not link.live or not np.isfinite(command).all():
+        if self._only_measures or link.ended or not link.live or not np.isfinite(command).all():
             return EventStatus.DidNothing()
         mode = cast(ControlMode, self._driver.control_mode)
         if mode == "velocity":
@@ -247,7 +252,8 @@ class PandaClient(LeafSystem):
 
     def _send_hand(self, context: Context) -> EventStatus:
         link, opening = self._read(context), float(self._opening_input.Eval(context)[0])
-        if link.ended or not link.live or not np.isfinite(opening):
+        ended = link.ended and not self._only_measures
+        if ended or not link.live or not np.isfinite(opening):
             return EventStatus.DidNothing()
         utime = utime_of(self._clock(context))
         message = messages.hand_command(opening, force=self._driver.hand_force, utime=utime)

@@ -30,7 +30,8 @@ class PandaDriver:
 
     # Name in `lcm_buses`.
     lcm_bus: str = "default"
-    # "position" or "velocity"; the driver's process must have been started in the same.
+    # "position" or "velocity"; the driver's process must have been started in the same. Or
+    # "status_only": the arm is guided by hand and measured, the hand alone is commanded.
     control_mode: str = "position"
     # A command whose stamp differs by more (s) from the robot's clock is dropped there.
     expiry: float = 0.05

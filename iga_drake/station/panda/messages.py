@@ -21,8 +21,9 @@ from iga_drake.systems.ports import PANDA_JOINTS, ArmMode
 COMMAND_CHANNEL, STATUS_CHANNEL = "PANDA_COMMAND", "PANDA_STATUS"
 HAND_COMMAND_CHANNEL, HAND_STATUS_CHANNEL = "PANDA_HAND_COMMAND", "PANDA_HAND_STATUS"
 
-ControlMode = Literal["position", "velocity"]
+ControlMode = Literal["status_only", "position", "velocity"]
 CONTROL_MODES: dict[str, int] = {
+    "status_only": int(PandaControlMode.kNone),
     "position": int(PandaControlMode.kPosition),
     "velocity": int(PandaControlMode.kVelocity),
 }

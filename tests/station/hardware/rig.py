@@ -81,11 +81,16 @@ class BadLinkSender(ImageSender):
 
 
 def add_arm(
-    builder: DiagramBuilder, scenario: Scenario, lcm: DrakeLcm, *, now: Clock = clock
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    lcm: DrakeLcm,
+    *,
+    now: Clock = clock,
+    **options: Any,
 ) -> tuple[Any, BadLinkServer, dict[str, BadLinkSender]]:
-    """Adds the stub's arm and cameras behind `lcm`: the stub, its server and its
-    cameras' senders."""
-    arm = builder.AddNamedSystem("arm", stub_station(scenario))
+    """Adds the stub's arm and cameras behind `lcm`: the stub, with its `options`, its server and
+    its cameras' senders."""
+    arm = builder.AddNamedSystem("arm", stub_station(scenario, **options))
     driver = scenario.model_drivers["panda"]
     server = BadLinkServer(lcm, control_mode=driver.control_mode, clock=now)
     add_panda_server(builder, server, lcm)
