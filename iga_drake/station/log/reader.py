@@ -24,7 +24,7 @@ _IMAGES = ("color", "depth", "label")
 
 
 @dataclass(frozen=True)
-class CameraFrame:
+class RecordedFrame:
     """When one camera's images were recorded and taken (s on the diagram's clock), and from where:
     X_WC (4, 4)."""
 
@@ -58,7 +58,7 @@ class EpisodeLog:
     # Port of the contract -> its values, (N,) each.
     vectors: Mapping[str, Track]
     # Camera -> its frames in order of time.
-    frames: Mapping[str, tuple[CameraFrame, ...]]
+    frames: Mapping[str, tuple[RecordedFrame, ...]]
     status: Track
     observations: Mapping[str, Observation] = field(default_factory=dict)
     # Of each waypoint inferred, in order.
@@ -124,7 +124,7 @@ def _content(path: Path, file: "_Messages") -> EpisodeLog:
         times, values = columns[name]
         return Track(np.array(times), tuple(values))
 
-    frames: dict[str, list[CameraFrame]] = defaultdict(list)
+    frames: dict[str, list[RecordedFrame]] = defaultdict(list)
     observed: dict[str, dict[str, Any]] = {}
     clouds: dict[str, np.ndarray] = {}
     estimates: list[PoseEstimate] = []
@@ -153,7 +153,7 @@ def _content(path: Path, file: "_Messages") -> EpisodeLog:
             clouds[kind] = messages.read_cloud(values)
         elif kind == "frame":
             stamp = np.nan if values["time"] is None else values["time"]
-            frames[camera].append(CameraFrame(time, stamp, _array(values["X_WC"])))
+            frames[camera].append(RecordedFrame(time, stamp, _array(values["X_WC"])))
     vectors = {
         port.name: track(port.name) for port in station_ports(()) if port.kind.startswith("vector")
     }
