@@ -262,6 +262,8 @@ def test_exit_status_follows_the_verdict(monkeypatch, tmp_path: Path):
     from iga_drake.tasks import episode
 
     class FakeEpisode:
+        log = None
+
         def __init__(self, scenario, *, seed, split, meshcat, record=None):
             self.task, self.seed, self.split = make_task(scenario.task.name), seed, split
             assert scenario.aligner.name == "icp"
@@ -296,6 +298,8 @@ def test_a_live_run_without_a_terminal_neither_waits_nor_stays(monkeypatch, caps
     seeds, rates = [], []
 
     class FakeEpisode:
+        log = None
+
         def __init__(self, scenario, *, seed, split, meshcat, record=None):
             self.task, self.seed = make_task(scenario.task.name), seed
             seeds.append(seed)
