@@ -125,8 +125,9 @@ class TeachingSession:
           provenance: of the demonstration.
           restores: whether the whole world is in the diagram's context, so that `undo` and `replay`
             can put it back.
-          read_truth, judge: of a simulation, to tell whether the task is done: the true state in a
-            context of the diagram, and the verdict on such states.
+          read_truth: of a simulation, to tell whether the task is done: the true state in a context
+            of the diagram.
+          judge: of a simulation: the verdict on such states.
         """
         self.scenario, self.motion, self.restores = scenario, motion, restores
         self.proceed: Callable[[], bool] = lambda: True
