@@ -13,6 +13,7 @@ PARTIAL = ".partial"
 # How files of these kinds begin, by their suffix.
 _BEGINS = {
     ".html": (b"<!doctype html", b"<html"),
+    ".pdf": (b"%PDF",),
     ".png": (b"\x89PNG",),
     ".json": (b"{", b"["),
     ".safetensors": None,  # looked into by those who read them

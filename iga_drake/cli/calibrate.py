@@ -10,6 +10,7 @@ from iga_drake.cli.scenarios import add_scenario_arguments, scenario_of
 from iga_drake.cli.status import FAILURE, SUCCESS, CommandError
 from iga_drake.cli.subcommands import Subcommand, add_subcommands, run_subcommand
 from iga_drake.errors import IgaDrakeError, check_range
+from iga_drake.files import output_file, output_folder
 
 if TYPE_CHECKING:
     from iga_drake.drivers.calibration.board import CharucoBoard
@@ -69,24 +70,24 @@ def _board_of(arguments: argparse.Namespace) -> "CharucoBoard":
 
 def add_board_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga calibrate board`."""
-    parser.add_argument("--out", type=Path, default=Path("board.pdf"), help=".pdf or .png")
+    parser.add_argument("--out", type=output_file, default="board.pdf", help=".pdf or .png")
     _add_board_options(parser)
 
 
 def run_board(arguments: argparse.Namespace) -> int:
     """Writes the board in its true size."""
     from iga_drake.drivers.calibration.board import write_board
-    from iga_drake.files import check_output
 
     board = _board_of(arguments)
-    check_output(arguments.out, begins={".pdf": (b"%PDF",)}.get(arguments.out.suffix.lower()))
     print(write_board(arguments.out, board))
     return SUCCESS
 
 
 def add_collect_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga calibrate collect`."""
-    parser.add_argument("--out", type=Path, required=True, help="folder; what is there is kept")
+    parser.add_argument(
+        "--out", type=output_folder, required=True, help="folder; what is there is kept"
+    )
     parser.add_argument("--cameras", required=True, help="names in the scenario, between commas")
     parser.add_argument("--lcm-url", default=_URL, help="bus of cameras and arm")
     parser.add_argument(
@@ -104,12 +105,10 @@ def run_collect(arguments: argparse.Namespace) -> int:
     from iga_drake.cli.options import names
     from iga_drake.drivers.calibration.collect import CellWatcher, add_look, begin_measurements
     from iga_drake.drivers.calibration.measurements import Measurements
-    from iga_drake.files import check_output_folder
 
     url, folder = arguments.lcm_url, arguments.out
     check_range(url.startswith("udpm://"), "--lcm-url", url, "a udpm:// URL")
     check_range(0 < arguments.wait <= 3600, "--wait", arguments.wait, "above 0 to 3600")
-    check_output_folder(folder)
     lying = _pose_of(arguments.board_at)
     mounting = "gripper" if lying is None else "world"
     measurements = begin_measurements(
@@ -162,7 +161,7 @@ def add_solve_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("folder", type=Path, help="with measurements.yaml and its images")
     parser.add_argument(
-        "--out", type=Path, default=Path("calibration"), help="folder for CAMERA.yaml"
+        "--out", type=output_folder, default="calibration", help="folder for CAMERA.yaml"
     )
     helps = {
         "translation": "largest median error on held-out poses (m)",
@@ -188,7 +187,6 @@ def run_solve(arguments: argparse.Namespace) -> int:
         read_measurements,
     )
     from iga_drake.drivers.calibration.solve import CalibrationLimits, solve_cameras
-    from iga_drake.files import check_output_folder
     from iga_drake.station.hardware.calibration import CameraCalibration, write_calibration
 
     limits = CalibrationLimits(
@@ -196,7 +194,6 @@ def run_solve(arguments: argparse.Namespace) -> int:
     )
     limits.check("--")
     measurements = read_measurements(arguments.folder)
-    check_output_folder(arguments.out)
     sights, without = find_boards(arguments.folder, measurements)
     for name in without:
         print(f"{name}: no board found")

@@ -4,13 +4,18 @@ import argparse
 from pathlib import Path
 
 from iga_drake.cli.status import CommandError
+from iga_drake.files import output_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga export lerobot`."""
     parser.add_argument("logs", type=Path, nargs="+", help="MCAP files that --record wrote")
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder to write, not there yet"
+        "--out",
+        type=output_folder,
+        required=True,
+        metavar="DIR",
+        help="folder to write, not there yet",
     )
     parser.add_argument("--fps", type=int, default=15, help="rows in a second")
     parser.add_argument(

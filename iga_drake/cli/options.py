@@ -3,11 +3,13 @@
 import argparse
 import math
 from collections.abc import Collection
+from functools import partial
 from typing import Any
 
 import yaml
 
 from iga_drake.cli.status import CommandError
+from iga_drake.files import output_file
 
 
 def seed(text: str) -> int:
@@ -16,6 +18,14 @@ def seed(text: str) -> int:
     if not 0 <= number < 2**31:
         raise argparse.ArgumentTypeError(f"{number} found, an integer from 0 to 2^31 - 1 expected")
     return number
+
+
+def add_result_argument(parser: argparse.ArgumentParser) -> None:
+    """Adds `--result`, a file for the result of one episode."""
+    parser.add_argument(
+        "--result", type=partial(output_file, begins=(b'{"task"',)), metavar="JSON",
+        help="write the result as JSON",
+    )  # fmt: skip
 
 
 def seconds(text: str) -> float:

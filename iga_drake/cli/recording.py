@@ -10,10 +10,18 @@ if TYPE_CHECKING:
     from iga_drake.tasks.episode import LogRequest
 
 
+def _new_log(text: str) -> Path:
+    """The path of a log that isn't there yet, checked before any work is done."""
+    from iga_drake.station.log.writer import check_new_log
+
+    check_new_log(Path(text))
+    return Path(text)
+
+
 def add_record_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds `--record` and `--image-period`."""
     parser.add_argument(
-        "--record", type=Path, metavar="MCAP",
+        "--record", type=_new_log, metavar="MCAP",
         help="keep a raw log of images, clouds, joints, commands and the policy's states (needs "
         "the extra `record`)",
     )  # fmt: skip

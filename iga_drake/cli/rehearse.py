@@ -3,9 +3,8 @@
 import argparse
 import dataclasses
 import json
-from pathlib import Path
 
-from iga_drake.cli.options import add_aligner_options, aligner_options, seed
+from iga_drake.cli.options import add_aligner_options, add_result_argument, aligner_options, seed
 from iga_drake.cli.recording import add_record_arguments, log_request, tell_of_log
 from iga_drake.cli.run import add_cell_argument, with_cell
 from iga_drake.cli.scenarios import (
@@ -15,7 +14,7 @@ from iga_drake.cli.scenarios import (
     with_aligner,
 )
 from iga_drake.cli.status import FAILURE, SUCCESS, CommandError
-from iga_drake.files import check_output, write_text
+from iga_drake.files import write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,15 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "repeated exactly",
     )  # fmt: skip
     add_record_arguments(parser)
-    parser.add_argument("--result", type=Path, metavar="JSON", help="write the result as JSON")
+    add_result_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Rehearses, tells how it goes, writes what was asked for."""
-    from iga_drake.station.log.writer import check_new_log
-
-    check_output(arguments.result, begins=(b'{"task"',))
-    check_new_log(arguments.record)
     rate = arguments.realtime
     if rate is not None and not 0.01 <= rate <= 1.0:
         raise CommandError(f"--realtime {rate:g}: 0.01 to 1 is expected")

@@ -4,10 +4,9 @@ import argparse
 import dataclasses
 import json
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from iga_drake.cli.options import add_aligner_options, aligner_options, seed
+from iga_drake.cli.options import add_aligner_options, add_result_argument, aligner_options, seed
 from iga_drake.cli.recording import add_record_arguments, log_request, tell_of_log
 from iga_drake.cli.scenarios import (
     add_demonstrations_argument,
@@ -16,7 +15,7 @@ from iga_drake.cli.scenarios import (
     with_aligner,
 )
 from iga_drake.cli.status import FAILURE, SUCCESS, CommandError
-from iga_drake.files import check_output, write_text
+from iga_drake.files import write_text
 
 if TYPE_CHECKING:
     from iga_drake.tasks.arm_episode import ArmResult
@@ -40,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "the task is done (default in a terminal)",
     )  # fmt: skip
     add_record_arguments(parser)
-    parser.add_argument("--result", type=Path, metavar="JSON", help="write the result as JSON")
+    add_result_argument(parser)
 
 
 def add_cell_argument(parser: argparse.ArgumentParser) -> None:
@@ -59,11 +58,8 @@ def with_cell(arguments: argparse.Namespace) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Waits for the arm, runs the episode, asks how it went, writes what was asked for."""
     from iga_drake.aligners.registry import PRIVILEGED
-    from iga_drake.station.log.writer import check_new_log
     from iga_drake.tasks.arm_episode import ArmEpisode
 
-    check_output(arguments.result, begins=(b'{"task"',))
-    check_new_log(arguments.record)
     with_cell(arguments)
     scenario = scenario_of(arguments)
     name = arguments.aligner or scenario.aligner.name

@@ -4,11 +4,16 @@ import argparse
 import json
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from iga_drake.cli.options import add_aligner_options, aligner_options, seconds, seed
+from iga_drake.cli.options import (
+    add_aligner_options,
+    add_result_argument,
+    aligner_options,
+    seconds,
+    seed,
+)
 from iga_drake.cli.recording import add_record_arguments, log_request, tell_of_log
 from iga_drake.cli.scenarios import (
     add_demonstrations_argument,
@@ -74,15 +79,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write a picture of every phase (needs matplotlib)",
     )
     add_record_arguments(parser)
-    result = partial(output_file, begins=(b'{"task"',))
-    parser.add_argument("--result", type=result, metavar="JSON", help="write the result as JSON")
+    add_result_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Runs the episode, tells how it goes, writes what was asked for."""
-    from iga_drake.station.log.writer import check_new_log
-
-    check_new_log(arguments.record)  # before minutes of simulation
     scenario = scenario_of(arguments)
     name = arguments.aligner or scenario.aligner.name
     scenario = with_aligner(scenario, name, aligner_options(arguments, [name])[name])

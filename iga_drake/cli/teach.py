@@ -2,18 +2,22 @@
 
 import argparse
 import sys
-from pathlib import Path
 
 from iga_drake.cli.options import seconds, seed
 from iga_drake.cli.scenarios import add_scenario_arguments, scenario_of
 from iga_drake.cli.status import SUCCESS, CommandError
+from iga_drake.files import output_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga teach`."""
     add_scenario_arguments(parser)
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder for the demonstrations"
+        "--out",
+        type=output_folder,
+        required=True,
+        metavar="DIR",
+        help="folder for the demonstrations",
     )
     parser.add_argument(
         "--add", action="store_true", help="keep the demonstrations that are in DIR, add to them"

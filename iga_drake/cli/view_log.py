@@ -3,14 +3,14 @@
 import argparse
 from pathlib import Path
 
-from iga_drake.files import check_output, write_text
+from iga_drake.files import output_file, write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `iga view log`."""
     parser.add_argument("log", type=Path, help="an MCAP file that --record wrote")
     parser.add_argument(
-        "--html", type=Path, metavar="OUT", help="write a replay instead of serving one"
+        "--html", type=output_file, metavar="OUT", help="write a replay instead of serving one"
     )
 
 
@@ -26,7 +26,6 @@ def run(arguments: argparse.Namespace) -> None:
         write_or_serve,
     )
 
-    check_output(arguments.html)
     log = read_episode_log(arguments.log)
     known = log.metadata
     print(f"{known.get('task')}, seed {known.get('seed')}, aligner {known.get('aligner')}")

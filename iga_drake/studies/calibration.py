@@ -21,7 +21,7 @@ from iga_drake.drivers.calibration.board import CharucoBoard, opencv
 from iga_drake.drivers.calibration.measurements import BoardSight, hand_poses
 from iga_drake.drivers.calibration.solve import solve_cameras
 from iga_drake.errors import check_range
-from iga_drake.files import check_output, replacing
+from iga_drake.files import output_file, replacing
 from iga_drake.progress import progress
 from iga_drake.station.cameras.rgbd import Intrinsics, look_at
 from iga_drake.station.panda.model import HOME_POSITION
@@ -307,7 +307,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             f"--{name.replace('_', '-')}", type=float, default=value,
             help="see ImageErrors in iga_drake/studies/calibration.py",
         )  # fmt: skip
-    parser.add_argument("--png", type=Path, help="write one of the rendered images")
+    parser.add_argument("--png", type=output_file, help="write one of the rendered images")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -320,7 +320,6 @@ def run(arguments: argparse.Namespace) -> int:
     mountings = ("gripper", "world") if arguments.mounting == "both" else (arguments.mounting,)
     trials = []
     if arguments.png is not None:
-        check_output(arguments.png)
         _write_example(arguments.png, arguments.seed, errors)
     seeds = range(arguments.seed, arguments.seed + arguments.count)
     for mounting, k in progress([(m, k) for m in mountings for k in seeds], "set-ups"):

@@ -10,12 +10,12 @@ from iga_drake import cli
 
 # Options that name files or folders to read. Every other one that takes a path is an output.
 INPUTS = {
-    "--compare", "--config", "--demonstrations", "--descriptor", "--encoder", "--energy",
-    "--initial", "--weights",
+    "--calibration", "--compare", "--config", "--demonstrations", "--descriptor", "--encoder",
+    "--energy", "--initial", "--weights",
 }  # fmt: skip
 OUTPUTS = {
     "--card", "--energy-card", "--half", "--html", "--junit", "--markdown", "--out", "--png",
-    "--problems", "--result", "--results",
+    "--problems", "--record", "--result", "--results",
 }  # fmt: skip
 
 

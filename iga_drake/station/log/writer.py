@@ -171,9 +171,9 @@ def check_new_log(path: Path | None) -> None:
     written over. None is no log."""
     if path is None:
         return
+    check_output(path)
     if path.suffix != ".mcap":
         raise ConfigError(f"{path}: a log's name ends with .mcap")
-    check_output(path)
     if path.exists() and path.stat().st_size > 0:
         raise OutputError(f"{path}: is there already and not overwritten: name another file")
 
