@@ -60,8 +60,8 @@ def raw_message(pixels: np.ndarray, kind: str, camera: str) -> Any:
 
 def read_raw(message: Any, kind: str) -> np.ndarray:
     """(H, W, 1) float32 or int16 of `raw_message`."""
-    pixels = np.frombuffer(message.data, dtype=_RAW[kind][1])
-    pixels = pixels.reshape(message.height, message.width, 1)
+    flat: np.ndarray = np.frombuffer(message.data, dtype=_RAW[kind][1])
+    pixels = flat.reshape(message.height, message.width, 1)
     return pixels.view("<i2") if kind == "label" else pixels
 
 
