@@ -155,7 +155,8 @@ def train_peer(
         rate_factors=peer.rate_factors,
     )
     batches = _batches(peer, config, samples, run, workers)
-    ranks, whole = run.ranks, []
+    ranks = run.ranks
+    whole: list[Batch] = []
     while run.goes_on():
         if run.step % config.uses == 0 or not whole:
             # Networks that samples are made with may be built here, once a process, at random.

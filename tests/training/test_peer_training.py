@@ -88,7 +88,9 @@ def test_a_stopped_run_goes_on_to_the_same_weights(name: str, tmp_path: Path) ->
     path = tmp_path / "half" / f"{name}.safetensors"
     aligner = make_aligner(name, weights=path)
     net, _ = load_peer(path, name, type(peer.model), peer.network)
-    assert aligner.weights_digest != make_aligner(name, weights=_other(path, net, name)).weights_digest
+    assert (
+        aligner.weights_digest != make_aligner(name, weights=_other(path, net, name)).weights_digest
+    )
 
 
 def _other(path: Path, net: torch.nn.Module, name: str) -> Path:
@@ -128,7 +130,11 @@ def test_any_pair_is_the_test_and_fields_stay_together() -> None:
         some = drawn_pairs(batch, torch.Generator().manual_seed(seed))
         pairs = some["points"].shape[2]
         chosen = [
-            next(n for n in range(5) if torch.equal(batch["points"][:, :, n], some["points"][:, :, k]))
+            next(
+                n
+                for n in range(5)
+                if torch.equal(batch["points"][:, :, n], some["points"][:, :, k])
+            )
             for k in range(pairs)
         ]
         assert len(set(chosen)) == pairs

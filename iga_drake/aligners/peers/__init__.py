@@ -24,4 +24,8 @@ def _rndf(**options: Any) -> Aligner:
     return RndfAligner(**options)
 
 
-ALIGNERS: dict[str, Callable[..., Aligner]] = {"reldist": _reldist, "taxpose": _taxpose, "rndf": _rndf}
+ALIGNERS: dict[str, Callable[..., Aligner]] = {
+    "reldist": _reldist,
+    "taxpose": _taxpose,
+    "rndf": _rndf,
+}

@@ -2,10 +2,9 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
-import torch
 from torch import Tensor, nn
 
 from iga_drake.aligners.protocol import PoseEstimate
@@ -16,17 +15,13 @@ from iga_drake.paths import models_dir
 PeerNetwork = TypeVar("PeerNetwork", bound=nn.Module)
 
 
-class _Sizes(Protocol):
-    __dataclass_fields__: Any
-
-
 def landed_weights(name: str) -> Path:
     """The weights of a peer that come with the package."""
     return models_dir() / "weights" / f"{name}.safetensors"
 
 
 def load_peer(
-    path: Path, name: str, sizes: type[_Sizes], build: Callable[[Any], PeerNetwork]
+    path: Path, name: str, sizes: type, build: Callable[[Any], PeerNetwork]
 ) -> tuple[PeerNetwork, dict]:
     """The trained network (evaluation mode) of the peer `name`, and its card.
 
@@ -49,4 +44,4 @@ def rigid_pose(motion: Tensor) -> np.ndarray:
 
 def one_pose(X: np.ndarray, energy: float) -> PoseEstimate:
     """The estimate of a method that knows one pose (4, 4)."""
-    return PoseEstimate(X[None], np.array([energy]), torch.ones(1).numpy())
+    return PoseEstimate(X[None], np.array([energy]), np.ones(1))

@@ -144,8 +144,8 @@ class RelDistNet(nn.Module):
         mean, spread = carried.mean(1), (carried.var(1, correction=0) + 1e-6).sqrt()
         demonstrated = torch.stack((mean, mean.reciprocal(), spread, unsure), -1)
         features_A, features_B = (
-            asked.descriptors * asked.descriptors.shape[-1] ** 0.5
-        ).unflatten(0, (-1, 2)).unbind(1)
+            (asked.descriptors * asked.descriptors.shape[-1] ** 0.5).unflatten(0, (-1, 2)).unbind(1)
+        )
         hidden = (
             self.of_A(features_A)[:, :, None]
             + self.of_B(features_B)[:, None]

@@ -79,9 +79,9 @@ class DescriptorField(nn.Module):
         self.out = VectorLinear(C, L)
         self.direction = VectorLinear(L, L)
         self.embed = nn.Linear(2 * L + 1, config.width)
-        self.layers = nn.ModuleList(
-            nn.ModuleList(nn.Linear(config.width, config.width) for _ in range(2))
-            for _ in range(config.layers)
+        self.first, self.second = (
+            nn.ModuleList(nn.Linear(config.width, config.width) for _ in range(config.layers))
+            for _ in range(2)
         )
         self.head = nn.Linear(config.width, 1)
 
@@ -108,7 +108,7 @@ class DescriptorField(nn.Module):
         inputs = (places.square().sum(-1, keepdim=True), places @ latent, own)
         h = self.embed(torch.cat(inputs, -1))
         held = []
-        for first, second in self.layers:  # type: ignore[misc]
+        for first, second in zip(self.first, self.second, strict=True):
             hidden = first(nn.functional.relu(h))
             h = h + second(nn.functional.relu(hidden))
             held += [hidden, h]
@@ -206,12 +206,8 @@ class RndfAligner:
         query = places[0] + config.spread * torch.randn(config.queries, 3, generator=generator)
         wanted = self._demonstrated(A, B, places, query, generator)
         found = [
-            self._placed(
-                [seen], [descriptors], query, (first.centre, seen.centre), generator
-            )
-            for first, seen, descriptors in zip(
-                (A[0], B[0]), (A[-1], B[-1]), wanted, strict=True
-            )
+            self._placed([seen], [descriptors], query, (first.centre, seen.centre), generator)
+            for first, seen, descriptors in zip((A[0], B[0]), (A[-1], B[-1]), wanted, strict=True)
         ]  # poses of the query points in the objects' shifted frames
         (of_A, off_A), (of_B, off_B) = found
         X = (of_B.double() @ inverse(of_A.double())).numpy()
@@ -284,9 +280,11 @@ class RndfAligner:
             for step in range(config.steps):
                 if step == config.steps // 4:  # the worse half has had its chance
                     with torch.no_grad():
-                        left = off(*posed(), slice(None)).topk(
-                            max(1, len(R) // 3), largest=False
-                        ).indices
+                        left = (
+                            off(*posed(), slice(None))
+                            .topk(max(1, len(R) // 3), largest=False)
+                            .indices
+                        )
                     R, pivot = R[left], pivot[left]
                     state = [(p, p.detach()[left]) for p in (turn, shift)]
                     for p, kept in state:

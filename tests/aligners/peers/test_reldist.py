@@ -53,7 +53,9 @@ def _moved(X: np.ndarray, cloud: np.ndarray) -> np.ndarray:
 def test_the_pose_moves_with_either_cloud() -> None:
     """Untrained: whatever it says, it says of the objects and not of their frames."""
     torch.manual_seed(0)
-    net = RelDistNet(RelDistConfig(scalars=16, vectors=4, heads=2, layers=2, descriptor=8, hidden=8))
+    net = RelDistNet(
+        RelDistConfig(scalars=16, vectors=4, heads=2, layers=2, descriptor=8, hidden=8)
+    )
     torch.nn.init.normal_(net.kernel[-1].weight, std=0.3)
     aligner = RelDistAligner(net)
     points = make_sample("validation", 3).points.astype(float)
@@ -66,9 +68,7 @@ def test_the_pose_moves_with_either_cloud() -> None:
         for X, a in zip(G, context, strict=True)
     )
     after = aligner.align(turned, _moved(F, points[0, -1]), _moved(W, points[1, -1]))
-    np.testing.assert_allclose(
-        after.poses[0], W @ before.poses[0] @ np.linalg.inv(F), atol=2e-3
-    )
+    np.testing.assert_allclose(after.poses[0], W @ before.poses[0] @ np.linalg.inv(F), atol=2e-3)
     np.testing.assert_allclose(after.energies, before.energies, rtol=1e-2)
 
 
