@@ -1,14 +1,11 @@
 """TAX-Pose-DC: learns one pair of objects, and puts it back from any pose."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from iga_drake.aligners.peers.taxpose import EdgeLayer, TaxPoseAligner, TaxPoseConfig, TaxPoseNet
-from iga_drake.dataset.loader import collate
 from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.training.taxpose import TaxPoseTraining, taxpose_loss
@@ -43,13 +40,13 @@ def test_an_edge_layer_is_the_largest_over_the_nearest_points() -> None:
 def learned() -> tuple[TaxPoseAligner, np.ndarray]:
     """Trained on one pair of clouds alone, and these (2, P, 3)."""
     sample = make_sample("validation", 1, SampleConfig(cloud_points=96))
-    points = np.repeat(sample.points[:, -1:], 2, 1)  # shown once, then asked
-    same = dataclasses.replace(sample, points=points)
-    batch = {k: v for k, v in collate([same]).items() if k in ("points", "canonical", "present")}
-    batch |= {k: batch[k][:, :, :2] for k in ("canonical", "present")}
+    fields = ("points", "canonical", "present")
+    # Shown once, then asked.
+    same = {name: np.repeat(getattr(sample, name)[:, -1:], 2, 1) for name in fields}
+    batch = {name: torch.from_numpy(value)[None] for name, value in same.items()}
     torch.manual_seed(0)
     net, generator = TaxPoseNet(TINY), torch.Generator().manual_seed(0)
-    steps = 250
+    steps = 150
     optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.02, steps)
     for _ in range(steps):
@@ -57,7 +54,7 @@ def learned() -> tuple[TaxPoseAligner, np.ndarray]:
         taxpose_loss(net, batch, TaxPoseTraining(), generator).total.backward()
         optimizer.step()
         schedule.step()
-    return TaxPoseAligner(net), points[:, 0].astype(float)
+    return TaxPoseAligner(net), same["points"][:, 0].astype(float)
 
 
 @pytest.mark.parametrize("seed", range(3))
