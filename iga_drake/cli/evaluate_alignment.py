@@ -38,7 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--weights", help="short for --option weights=FILE")
     parser.add_argument("--energy", help="short for --option energy=FILE")
     card = partial(output_file, begins=(b"#",))
-    parser.add_argument("--card", type=card, help="write a model card of the weights (of iga, or of a peer alone)")
+    parser.add_argument(
+        "--card", type=card, help="write a model card of iga's weights, or of a single peer's"
+    )
     parser.add_argument("--energy-card", type=card, help="write one of its energy")
     parser.add_argument("--json", action="store_true", help="print the errors as JSON")
 
