@@ -131,12 +131,12 @@ class _Seen(NamedTuple):
 class RndfSearch:
     """Options of the search for the query points' poses."""
 
-    queries: int = 96
+    queries: int = 64
     spread: float = 0.03  # m, standard deviation of the query points about the interaction
-    starts: int = 256  # rotations that are compared
+    starts: int = 192  # rotations that are compared
     coarse_queries: int = 24  # in the comparison
     kept: int = 10  # starts that descend
-    steps: int = 80  # of Adam
+    steps: int = 60  # of Adam
     turn_rate: float = 0.06  # rad, of a step
     shift_rate: float = 0.006  # m
 
