@@ -92,6 +92,7 @@ class WaypointResult:
             "name": self.name,
             "energy": self.energy,
             "familiarity": None if known is None else known.tolist(),
+            "confidence": self.estimate.confidence,
             "position_error": self.position_error,
             "rotation_error": self.rotation_error,
             "inference_seconds": self.inference_seconds,
