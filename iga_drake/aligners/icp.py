@@ -7,6 +7,8 @@ from demonstration to test the answer is `X_B X_A^-1`. Many starts descend toget
 registrations. Where an object's way up is known, its registrations start from turns about it.
 """
 
+from typing import Any
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -103,11 +105,12 @@ class IcpAligner:
         """Motion (4, 4) of the source cloud onto the goal and the symmetric mean distance (m)."""
         o3d = _open3d()
         reg = o3d.pipelines.registration
-        coarse = []
-        for cloud in (source, goal):
+
+        def few(cloud: Any) -> np.ndarray:
             points = np.asarray(cloud.voxel_down_sample(self.voxel).points)
-            coarse.append(points[rng.permutation(len(points))[:_COARSE_POINTS]])
-        R, p, _ = _descended(*coarse, _starts(self.starts, rng, ups))
+            return points[rng.permutation(len(points))[:_COARSE_POINTS]]
+
+        R, p, _ = _descended(few(source), few(goal), _starts(self.starts, rng, ups))
         best: tuple[float, np.ndarray] | None = None
         for k in range(min(self.refined, len(R))):
             X = np.eye(4)

@@ -22,7 +22,7 @@ from iga_drake.training.descriptor import DescriptorSettings, train_descriptor
 from iga_drake.training.energy import EnergySettings, train_energy
 from iga_drake.training.options import add_run_options, run_options, with_options
 from iga_drake.training.ranks import process_group
-from iga_drake.training.run import training_kept
+from iga_drake.training.run import flushed_denormals, training_kept
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -92,7 +92,11 @@ def run(arguments: argparse.Namespace) -> int:
 def _train(arguments: argparse.Namespace) -> int:
     if arguments.network == "encoder":
         return train_encoder.run(arguments)
-    torch.set_flush_denormal(True)
+    with flushed_denormals():
+        return _train_flushed(arguments)
+
+
+def _train_flushed(arguments: argparse.Namespace) -> int:
     if arguments.network == "familiarity":
         return train_familiarity.run(arguments)
     if arguments.network == "dif-net":

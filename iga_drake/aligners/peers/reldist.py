@@ -91,7 +91,7 @@ def multilaterate(
     return x
 
 
-class Relation(NamedTuple):
+class Multilateration(NamedTuple):
     """What the network says of S problems with M nodes an object and D demonstrations."""
 
     logits: Tensor  # (2 S, D, M, M) of matches of the test's nodes with a demonstration's
@@ -120,7 +120,7 @@ class RelDistNet(nn.Module):
             nn.GELU(), nn.Linear(config.hidden, config.hidden), nn.GELU(), last
         )
 
-    def forward(self, points: Tensor, nodes: Tensor, places: Tensor) -> Relation:
+    def forward(self, points: Tensor, nodes: Tensor, places: Tensor) -> Multilateration:
         """Relates the last pair, the test, as the others, the demonstrations.
 
         Args:
@@ -161,7 +161,7 @@ class RelDistNet(nn.Module):
         # A node counts as much as its most certain distances pin it.
         weight = precision.topk(min(8, M), dim=-1).values.mean(-1)
         weight = weight / weight.sum(-1, keepdim=True)
-        return Relation(logits, distance, scale, x, weight, kabsch(A[:, D], x, weight))
+        return Multilateration(logits, distance, scale, x, weight, kabsch(A[:, D], x, weight))
 
 
 @dataclass(frozen=True)

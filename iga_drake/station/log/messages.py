@@ -180,6 +180,7 @@ def estimate_values(name: str, estimate: PoseEstimate) -> dict[str, Any]:
         "energies": estimate.energies,
         "probabilities": estimate.probabilities,
         "familiarity": estimate.familiarity,
+        "confidence": estimate.confidence,
     }
 
 
@@ -191,6 +192,7 @@ def read_estimate(values: Mapping[str, Any]) -> PoseEstimate:
         energies=np.array(values["energies"]),
         probabilities=np.array(values["probabilities"]),
         familiarity=None if known is None else np.array(known),
+        confidence=values.get("confidence"),
     )
 
 
