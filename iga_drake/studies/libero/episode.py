@@ -1,0 +1,307 @@
+"""Demonstrations by the expert, and episodes in which an aligner says where the hand has to go."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from iga_drake.aligners.protocol import Aligner, AlignerError, PoseEstimate
+from iga_drake.demonstrations.alignment import CloudError
+from iga_drake.demonstrations.demonstration import (
+    Demonstration,
+    DemonstrationSet,
+    Observation,
+    Provenance,
+    Waypoint,
+)
+from iga_drake.studies.libero.benchmark import CAMERAS, STEPS, LiberoScene
+from iga_drake.studies.libero.expert import (
+    ExpertError,
+    grasp_across,
+    grasp_rim,
+    place_in,
+    place_on,
+)
+from iga_drake.studies.libero.motion import (
+    Stretch,
+    distance,
+    grasp_way,
+    nearest_turn,
+    osc_action,
+    place_way,
+)
+from iga_drake.studies.libero.perception import LabelledView, UnseenError, object_cloud
+from iga_drake.version import code_version
+
+TAKEN, GOAL = 1, 2  # labels
+UP = np.array([0.0, 0.0, 1.0])
+GRASP, PLACE = 0, 1  # waypoints
+TRAVEL, CARRY = 0.22, 0.32  # m above the ground, of E
+_OPENED, _SHUT = 0.08, 0.0  # m
+_STRETCH_STEPS = 50  # at most
+_EXACT, _ROUGH = (0.003, 0.02), (0.02, 0.1)  # m, rad from a stretch's end
+_EMPTY = 0.003  # m between the pads of a hand that holds nothing
+_AWAY = 0.15  # m from E to the nearest point of an object that isn't held
+_PENETRATION = 0.006  # m that the hand's points may lie below the ground
+
+Watch = Callable[[str, LiberoScene, Sequence[LabelledView]], None]
+
+
+def _no_watch(when: str, scene: LiberoScene, views: Sequence[LabelledView]) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class LiberoResult:
+    """What came of one episode."""
+
+    success: bool
+    # Where it failed: perception, alignment, grasp (nothing was held), place, time; "" for none.
+    cause: str
+    reason: str
+    steps: int  # of 1/20 s, after settling
+    # Of grasp and place, as far as they were asked: familiarity of both objects, probability and
+    # rank of the mode taken, seconds of inference.
+    familiarity: list[list[float]] = field(default_factory=list)
+    probability: list[float] = field(default_factory=list)
+    mode: list[int] = field(default_factory=list)
+    inference_seconds: list[float] = field(default_factory=list)
+    perception_seconds: list[float] = field(default_factory=list)
+    wall_seconds: float = 0.0
+
+
+class _Failure(Exception):
+    def __init__(self, cause: str, reason: str):
+        super().__init__(reason)
+        self.cause = cause
+
+
+class _Succeeded(Exception):
+    """The benchmark calls the task done."""
+
+
+class _Hand:
+    """Moves a scene's hand along stretches, and counts the steps."""
+
+    def __init__(self, scene: LiberoScene, limit: int, *, until_done: bool = True):
+        self.scene, self.limit, self.steps = scene, limit, 0
+        self.until_done, self.done = until_done, False
+
+    def _step(self, stretch: Stretch) -> None:
+        if self.steps >= self.limit:
+            raise _Failure("time", f"{self.limit} steps are over")
+        self.steps += 1
+        self.done = self.scene.step(osc_action(self.scene.X_WE, stretch.X_WE, stretch.hand))
+        if self.done and self.until_done:
+            raise _Succeeded
+
+    def follow(self, way: Sequence[Stretch]) -> None:
+        """Goes along the stretches; one whose end isn't reached in time is left for the next."""
+        for stretch in way:
+            shift, turn = _EXACT if stretch.exact else _ROUGH
+            for _ in range(_STRETCH_STEPS):
+                away = distance(self.scene.X_WE, stretch.X_WE)
+                if away[0] < shift and away[1] < turn:
+                    break
+                self._step(stretch)
+            for _ in range(stretch.wait):
+                self._step(stretch)
+
+
+def _held_cloud(scene: LiberoScene, views: Sequence[LabelledView]) -> np.ndarray:
+    """The cloud of what is taken, in E."""
+    cloud, X = object_cloud(views, TAKEN, scene.taken), scene.X_WE
+    return (cloud - X[:3, 3]) @ X[:3, :3]
+
+
+def demonstrate(scene: LiberoScene, state: int, watch: Watch = _no_watch) -> Demonstration:
+    """The expert does the task from an initial state.
+
+    Raises `ExpertError` where it doesn't succeed, `UnseenError` where the cameras see too little.
+    """
+    scene.start(state)
+    gripper, views = scene.gripper_cloud(), scene.views()
+    watch("start", scene, views)
+    taken, goal = object_cloud(views, TAKEN, scene.taken), object_cloud(views, GOAL, scene.goal)
+    hand = _Hand(scene, 10 * STEPS[scene.task.suite], until_done=False)
+    surface = scene.true_surface(scene.taken)
+    try:
+        grasp = grasp_across(surface)
+    except ExpertError:  # too wide
+        grasp = grasp_rim(surface, np.array([0.0, -1.0]))
+    way = grasp_way(
+        nearest_turn(scene.X_WE, grasp), scene.ground + TRAVEL, scene.ground + CARRY
+    )
+    hand.follow(way[:3])
+    grasp = scene.X_WE
+    hand.follow(way[3:])
+    views = scene.views()
+    watch("held", scene, views)
+    held, up_E = _held_cloud(scene, views), scene.X_WE[:3, :3].T @ UP
+    put = place_in if scene.relation == "in" else place_on
+    place = put(scene.X_WE, scene.true_surface(scene.taken), scene.true_surface(scene.goal))
+    way = place_way(place, scene.ground + CARRY)
+    hand.follow(way[:2])
+    place = scene.X_WE
+    hand.follow(way[2:])
+    watch("end", scene, ())
+    if not hand.done:
+        raise ExpertError(f"{scene.task.name}, initial state {state}: the expert didn't succeed")
+    up_E /= np.linalg.norm(up_E)
+    observations = {
+        "gripper": Observation(gripper, "gripper", "E", gravity=-up_E),
+        "taken": Observation(taken, "target", "W", upright=True),
+        "held": Observation(held, "grasped", "E", gravity=-up_E, upright=True),
+        "goal": Observation(goal, "target", "W", upright=True),
+    }
+    waypoints = (
+        Waypoint("grasp", _rigid(grasp), _SHUT, "gripper", "taken"),
+        Waypoint("place", _rigid(place), _OPENED, "held", "goal"),
+    )
+    provenance = Provenance(
+        source="scripted expert in LIBERO",
+        seed=state,
+        sensors=CAMERAS,
+        instances={"taken": scene.taken, "goal": scene.goal},
+        code=code_version(),
+    )
+    return Demonstration(observations, waypoints, provenance=provenance)
+
+
+def _rigid(X: np.ndarray) -> np.ndarray:
+    """The nearest rigid pose: MuJoCo's rotation matrices are orthonormal to 1e-6 alone."""
+    U, _, Vt = np.linalg.svd(X[:3, :3])
+    X = X.copy()
+    X[:3, :3] = U @ Vt
+    return X
+
+
+class _Run:
+    """One episode of an aligner."""
+
+    def __init__(
+        self,
+        scene: LiberoScene,
+        shown: DemonstrationSet,
+        aligner: Aligner,
+        seed: int,
+        limit: int,
+        watch: Watch,
+    ):
+        self.scene, self.shown, self.aligner, self.seed = scene, shown, aligner, seed
+        self.hand, self.watch = _Hand(scene, limit), watch
+        self.familiarity: list[list[float]] = []
+        self.probability: list[float] = []
+        self.mode: list[int] = []
+        self.inference: list[float] = []
+        self.perception: list[float] = []
+
+    def views(self, when: str) -> list[LabelledView]:
+        began = time.perf_counter()
+        views = self.scene.views()
+        self.perception.append(time.perf_counter() - began)
+        self.watch(when, self.scene, views)
+        return views
+
+    def pose(
+        self,
+        waypoint: int,
+        grasped: np.ndarray,
+        target: np.ndarray,
+        grasped_up: np.ndarray | None,
+        ways: Callable[[np.ndarray], list[Stretch]],
+    ) -> np.ndarray:
+        """The pose X_WE of the best mode of which the whole way can be reached."""
+        began = time.perf_counter()
+        try:
+            estimate = PoseEstimate.of(
+                self.aligner.align(
+                    self.shown.context(waypoint), grasped, target,
+                    grasped_up=grasped_up, target_up=UP, seed=self.seed,
+                )
+            )  # fmt: skip
+        except (AlignerError, CloudError) as error:
+            raise _Failure("alignment", str(error)) from error
+        self.inference.append(time.perf_counter() - began)
+        if estimate.familiarity is not None:
+            self.familiarity.append(np.round(estimate.familiarity, 4).tolist())
+        gripper = self.shown.demonstrations[0].observations["gripper"].points
+        for mode, X in enumerate(estimate.poses):
+            if waypoint == GRASP:
+                X = nearest_turn(self.scene.X_WE, X)
+            lowest = float((gripper @ X[2, :3]).min() + X[2, 3])
+            if lowest < self.scene.ground - _PENETRATION:
+                continue
+            if all(self.scene.reachable(stretch.X_WE) for stretch in ways(X)):
+                self.mode.append(mode)
+                self.probability.append(round(float(estimate.probabilities[mode]), 4))
+                return X
+        raise _Failure("alignment", f"none of {len(estimate.poses)} poses can be reached")
+
+    def run(self) -> None:
+        """Raises `_Succeeded` or `_Failure`, always."""
+        scene, ground = self.scene, self.scene.ground
+        views = self.views("start")
+        taken, goal = object_cloud(views, TAKEN, scene.taken), object_cloud(views, GOAL, scene.goal)
+        gripper = self.shown.demonstrations[0].observations["gripper"].points
+
+        def grasping(X: np.ndarray) -> list[Stretch]:
+            return grasp_way(X, ground + TRAVEL, ground + CARRY)
+
+        self.hand.follow(grasping(self.pose(GRASP, gripper, taken, None, grasping)))
+        views = self.views("held")
+        if scene.opening < _EMPTY:
+            raise _Failure("grasp", "the hand is closed on nothing")
+        held = _held_cloud(scene, views)
+        nearest = float(np.linalg.norm(held, axis=1).min())
+        if nearest > _AWAY:
+            raise _Failure("grasp", f"{scene.taken} is {nearest:.2f} m away from the hand")
+
+        def placing(X: np.ndarray) -> list[Stretch]:
+            return place_way(X, ground + CARRY)
+
+        up = scene.X_WE[:3, :3].T @ UP
+        self.hand.follow(placing(self.pose(PLACE, held, goal, up / np.linalg.norm(up), placing)))
+        raise _Failure("place", f"{scene.taken} was let go, the benchmark doesn't call it done")
+
+
+def run_episode(
+    scene: LiberoScene,
+    state: int,
+    shown: DemonstrationSet,
+    aligner: Aligner,
+    *,
+    seed: int = 0,
+    limit: int | None = None,
+    watch: Watch = _no_watch,
+) -> LiberoResult:
+    """Does the task from an initial state, as the demonstrations show it.
+
+    `limit`: steps, by default those of published evaluations of the suite.
+    """
+    began = time.perf_counter()
+    scene.start(state)
+    run = _Run(scene, shown, aligner, seed, limit or STEPS[scene.task.suite], watch)
+    cause, reason = "", ""
+    try:
+        run.run()
+    except _Succeeded:
+        pass
+    except _Failure as failure:
+        cause, reason = failure.cause, str(failure)
+    except UnseenError as error:
+        cause, reason = "perception", str(error)
+    watch("end", scene, ())
+    return LiberoResult(
+        success=not cause,
+        cause=cause,
+        reason=reason,
+        steps=run.hand.steps,
+        familiarity=run.familiarity,
+        probability=run.probability,
+        mode=run.mode,
+        inference_seconds=[round(s, 3) for s in run.inference],
+        perception_seconds=[round(s, 3) for s in run.perception],
+        wall_seconds=round(time.perf_counter() - began, 2),
+    )
