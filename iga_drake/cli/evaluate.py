@@ -34,7 +34,7 @@ SUBCOMMANDS = {
         "iga_drake.studies.familiarity", "how often own objects are refused, foreign ones accepted"
     ),
     "libero": Subcommand(
-        "iga_drake.studies.libero.study", "LIBERO-PRO's pick-and-place, in an environment of its own"
+        "iga_drake.studies.libero.study", "LIBERO-PRO's pick-and-place, in MuJoCo"
     ),
     "log": Subcommand("iga_drake.cli.evaluate_log", "poses inferred again from raw logs"),
     "moved-cameras": Subcommand(

@@ -161,8 +161,10 @@ class LiberoScene:
         return float(np.abs(self._sim.data.qpos[indices]).sum())
 
     def reachable(self, X_WE: np.ndarray) -> bool:
-        """Whether the arm, within its joints' limits, can bring the hand to a pose: found from where
-        it is by damped least squares. Collisions aren't looked at."""
+        """Whether the arm, within its joints' limits, can bring the hand to a pose.
+
+        Found from where it is by damped least squares. Collisions aren't looked at.
+        """
         mujoco = self._mujoco
         model, robot = self._model._model, self._env.robots[0]
         data = self._scratch
@@ -246,9 +248,7 @@ class LiberoScene:
             metric_depth(buffer[::-1].astype(np.float64), near, far),
             labels[::-1].copy(),
             float(np.radians(self._model.cam_fovy[k])),
-            optical_frame(
-                self._sim.data.cam_xmat[k].reshape(3, 3), self._sim.data.cam_xpos[k]
-            ),
+            optical_frame(self._sim.data.cam_xmat[k].reshape(3, 3), self._sim.data.cam_xpos[k]),
         )
 
     # -- shapes
@@ -268,9 +268,7 @@ class LiberoScene:
         """Points (P, 3) m in W on the true surface of an object; the expert's alone."""
         root = self._env.env.obj_body_id[name]
         bodies = [
-            k
-            for k in range(self._model.nbody)
-            if k == root or self._model.body_rootid[k] == root
+            k for k in range(self._model.nbody) if k == root or self._model.body_rootid[k] == root
         ]
         return self._surface(bodies, _SURFACE_POINTS)
 
@@ -304,4 +302,3 @@ class LiberoScene:
     def close(self) -> None:
         """Ends the simulation."""
         self._env.close()
-

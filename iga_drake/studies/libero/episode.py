@@ -60,7 +60,9 @@ class LiberoResult:
     # Where it failed: perception, alignment, grasp (nothing was held), place, time; "" for none.
     cause: str
     reason: str
-    steps: int  # of 1/20 s, after settling
+    steps: int  # of 1/20 s after settling, until the benchmark called it done or it failed
+    # Whether it still was done after the hand had let go and gone: more than the benchmark asks.
+    stays: bool
     # Of grasp and place, as far as they were asked: familiarity of both objects, probability and
     # rank of the mode taken, seconds of inference.
     familiarity: list[list[float]] = field(default_factory=list)
@@ -77,24 +79,22 @@ class _Failure(Exception):
         self.cause = cause
 
 
-class _Succeeded(Exception):
-    """The benchmark calls the task done."""
-
-
 class _Hand:
-    """Moves a scene's hand along stretches, and counts the steps."""
+    """Moves a scene's hand along stretches, counts the steps, and notes when the benchmark calls
+    the task done."""
 
-    def __init__(self, scene: LiberoScene, limit: int, *, until_done: bool = True):
+    def __init__(self, scene: LiberoScene, limit: int):
         self.scene, self.limit, self.steps = scene, limit, 0
-        self.until_done, self.done = until_done, False
+        self.done = False  # now
+        self.done_after: int | None = None  # steps, for the first time
 
     def _step(self, stretch: Stretch) -> None:
-        if self.steps >= self.limit:
+        if self.steps >= self.limit and self.done_after is None:
             raise _Failure("time", f"{self.limit} steps are over")
         self.steps += 1
         self.done = self.scene.step(osc_action(self.scene.X_WE, stretch.X_WE, stretch.hand))
-        if self.done and self.until_done:
-            raise _Succeeded
+        if self.done and self.done_after is None:
+            self.done_after = self.steps
 
     def follow(self, way: Sequence[Stretch]) -> None:
         """Goes along the stretches; one whose end isn't reached in time is left for the next."""
@@ -124,15 +124,13 @@ def demonstrate(scene: LiberoScene, state: int, watch: Watch = _no_watch) -> Dem
     gripper, views = scene.gripper_cloud(), scene.views()
     watch("start", scene, views)
     taken, goal = object_cloud(views, TAKEN, scene.taken), object_cloud(views, GOAL, scene.goal)
-    hand = _Hand(scene, 10 * STEPS[scene.task.suite], until_done=False)
+    hand = _Hand(scene, 10 * STEPS[scene.task.suite])
     surface = scene.true_surface(scene.taken)
     try:
         grasp = grasp_across(surface)
     except ExpertError:  # too wide
         grasp = grasp_rim(surface, np.array([0.0, -1.0]))
-    way = grasp_way(
-        nearest_turn(scene.X_WE, grasp), scene.ground + TRAVEL, scene.ground + CARRY
-    )
+    way = grasp_way(nearest_turn(scene.X_WE, grasp), scene.ground + TRAVEL, scene.ground + CARRY)
     hand.follow(way[:3])
     grasp = scene.X_WE
     hand.follow(way[3:])
@@ -240,7 +238,7 @@ class _Run:
         raise _Failure("alignment", f"none of {len(estimate.poses)} poses can be reached")
 
     def run(self) -> None:
-        """Raises `_Succeeded` or `_Failure`, always."""
+        """Raises `_Failure` or `UnseenError` where it doesn't come to its end."""
         scene, ground = self.scene, self.scene.ground
         views = self.views("start")
         taken, goal = object_cloud(views, TAKEN, scene.taken), object_cloud(views, GOAL, scene.goal)
@@ -263,7 +261,6 @@ class _Run:
 
         up = scene.X_WE[:3, :3].T @ UP
         self.hand.follow(placing(self.pose(PLACE, held, goal, up / np.linalg.norm(up), placing)))
-        raise _Failure("place", f"{scene.taken} was let go, the benchmark doesn't call it done")
 
 
 def run_episode(
@@ -283,21 +280,22 @@ def run_episode(
     began = time.perf_counter()
     scene.start(state)
     run = _Run(scene, shown, aligner, seed, limit or STEPS[scene.task.suite], watch)
-    cause, reason = "", ""
+    cause, reason = "place", f"{scene.taken} was let go, the benchmark doesn't call it done"
     try:
         run.run()
-    except _Succeeded:
-        pass
     except _Failure as failure:
         cause, reason = failure.cause, str(failure)
     except UnseenError as error:
         cause, reason = "perception", str(error)
+    hand = run.hand
+    success = hand.done_after is not None
     watch("end", scene, ())
     return LiberoResult(
-        success=not cause,
-        cause=cause,
-        reason=reason,
-        steps=run.hand.steps,
+        success=success,
+        cause="" if success else cause,
+        reason="" if success else reason,
+        steps=hand.done_after or hand.steps,
+        stays=hand.done,
         familiarity=run.familiarity,
         probability=run.probability,
         mode=run.mode,

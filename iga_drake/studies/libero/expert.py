@@ -1,4 +1,4 @@
-"""The scripted expert, which sees the true surfaces: grasps from above, and places into a container.
+"""The scripted expert, which sees the true surfaces: grasps from above, and places in or on.
 
 Used for demonstrations alone.
 """

@@ -42,7 +42,9 @@ def osc_action(X_WE: np.ndarray, goal: np.ndarray, hand: float) -> np.ndarray:
 def distance(X_WE: np.ndarray, goal: np.ndarray) -> tuple[float, float]:
     """m and rad between two poses."""
     R = goal[:3, :3] @ X_WE[:3, :3].T
-    return float(np.linalg.norm(goal[:3, 3] - X_WE[:3, 3])), float(Rotation.from_matrix(R).magnitude())
+    return float(np.linalg.norm(goal[:3, 3] - X_WE[:3, 3])), float(
+        Rotation.from_matrix(R).magnitude()
+    )
 
 
 def raised(X: np.ndarray, z: float) -> np.ndarray:

@@ -176,7 +176,9 @@ def _tasks_asked(text: str) -> list[int]:
 def run(arguments: argparse.Namespace, aligner: Aligner | None = None) -> int:
     """Runs the episodes that aren't in the results yet and prints the table of all."""
     count, episodes = arguments.demonstrations, arguments.episodes
-    check_range(1 <= count <= STATES // _TRIES, "--demonstrations", count, f"1 to {STATES // _TRIES}")
+    check_range(
+        1 <= count <= STATES // _TRIES, "--demonstrations", count, f"1 to {STATES // _TRIES}"
+    )
     most = STATES if arguments.variant != "none" else STATES - _TRIES * count
     check_range(1 <= episodes <= most, "--episodes", episodes, f"1 to {most}")
     check_range(0 <= arguments.seed < 2**31, "--seed", arguments.seed, "0 to 2^31 - 1")
@@ -219,9 +221,7 @@ def run(arguments: argparse.Namespace, aligner: Aligner | None = None) -> int:
                     continue
                 scene = scene or LiberoScene(task)
                 watch = frames(f"{number}-{task.variant}-{state}")
-                result = run_episode(
-                    scene, state, shown, aligner, seed=arguments.seed, watch=watch
-                )
+                result = run_episode(scene, state, shown, aligner, seed=arguments.seed, watch=watch)
                 rows.append((row, result))
                 if store:
                     store.add({**key, **row}, asdict(result))
