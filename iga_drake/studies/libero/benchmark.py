@@ -287,10 +287,8 @@ class LiberoScene:
             if model.geom_bodyid[geom] not in bodies or not drawn:
                 continue
             mesh = model.geom_dataid[geom]
-            first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-            vertices = model.mesh_vert[first : first + count]
-            first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-            faces = model.mesh_face[first : first + count]
+            vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
+            faces = model.mesh_face[model.mesh_faceadr[mesh] :][: model.mesh_facenum[mesh]]
             R = data.geom_xmat[geom].reshape(3, 3)
             placed = vertices @ R.T + data.geom_xpos[geom]
             parts.append(trimesh.Trimesh(placed, faces, process=False))

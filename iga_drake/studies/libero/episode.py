@@ -18,6 +18,7 @@ from iga_drake.demonstrations.demonstration import (
 from iga_drake.studies.libero.benchmark import CAMERAS, STEPS, LiberoScene
 from iga_drake.studies.libero.expert import (
     ExpertError,
+    TooWideError,
     grasp_across,
     grasp_rim,
     place_in,
@@ -43,6 +44,8 @@ _STRETCH_STEPS = 50  # at most
 _EXACT, _ROUGH = (0.003, 0.02), (0.02, 0.1)  # m, rad from a stretch's end
 _EMPTY = 0.003  # m between the pads of a hand that holds nothing
 _AWAY = 0.15  # m from E to the nearest point of an object that isn't held
+# Horizontal directions in W, from the middle of a vessel to where its rim is taken.
+_SIDES = ((0.0, -1.0), (0.0, 1.0), (-1.0, 0.0), (1.0, 0.0))
 _PENETRATION = 0.006  # m that the hand's points may lie below the ground
 
 Watch = Callable[[str, LiberoScene, Sequence[LabelledView]], None]
@@ -118,18 +121,31 @@ def _held_cloud(scene: LiberoScene, views: Sequence[LabelledView]) -> np.ndarray
 def demonstrate(scene: LiberoScene, state: int, watch: Watch = _no_watch) -> Demonstration:
     """The expert does the task from an initial state.
 
-    Raises `ExpertError` where it doesn't succeed, `UnseenError` where the cameras see too little.
+    What is too wide is taken at its rim, from the first side that works. Raises `ExpertError` where
+    it doesn't succeed, `UnseenError` where the cameras see too little.
     """
     scene.start(state)
-    gripper, views = scene.gripper_cloud(), scene.views()
+    try:
+        return _demonstrate(scene, state, grasp_across(scene.true_surface(scene.taken)), watch)
+    except TooWideError:
+        failures = []
+    for side in _SIDES:
+        scene.start(state)
+        grasp = grasp_rim(scene.true_surface(scene.taken), np.array(side))
+        try:
+            return _demonstrate(scene, state, grasp, watch)
+        except ExpertError as error:
+            failures.append(str(error))
+    raise ExpertError(failures[-1])
+
+
+def _demonstrate(scene: LiberoScene, state: int, grasp: np.ndarray, watch: Watch) -> Demonstration:
+    """The rest of `demonstrate`, with this grasp."""
+    views = scene.views()
     watch("start", scene, views)
     taken, goal = object_cloud(views, TAKEN, scene.taken), object_cloud(views, GOAL, scene.goal)
+    gripper = scene.gripper_cloud()
     hand = _Hand(scene, 10 * STEPS[scene.task.suite])
-    surface = scene.true_surface(scene.taken)
-    try:
-        grasp = grasp_across(surface)
-    except ExpertError:  # too wide
-        grasp = grasp_rim(surface, np.array([0.0, -1.0]))
     way = grasp_way(nearest_turn(scene.X_WE, grasp), scene.ground + TRAVEL, scene.ground + CARRY)
     hand.follow(way[:3])
     grasp = scene.X_WE

@@ -16,7 +16,11 @@ _ROOM = 0.015  # m between palm and rim, or between object and floor of the cont
 
 
 class ExpertError(IgaDrakeError):
-    """The expert knows no grasp or place."""
+    """The expert knows no grasp, or didn't succeed."""
+
+
+class TooWideError(ExpertError):
+    """An object doesn't fit between the pads."""
 
 
 def _from_above(p_W: np.ndarray, closing: np.ndarray) -> np.ndarray:
@@ -30,7 +34,7 @@ def _from_above(p_W: np.ndarray, closing: np.ndarray) -> np.ndarray:
 def grasp_across(surface: np.ndarray) -> np.ndarray:
     """X_WE (4, 4) that takes an object between the pads, across its narrowest horizontal width.
 
-    `surface` (P, 3) m in W: points on all of it. Raises `ExpertError` where it is too wide.
+    `surface` (P, 3) m in W: points on all of it. Raises `TooWideError` where it is too wide.
     """
     low, high = surface[:, 2].min(), surface[:, 2].max()
     z = max((low + high) / 2, high - _ABOVE_E, low + _LEAST_HEIGHT)
@@ -43,7 +47,9 @@ def grasp_across(surface: np.ndarray) -> np.ndarray:
     near = widths < widths.min() + 0.002
     k = int(np.argmax(np.where(near, np.abs(np.sin(angles)), -1)))
     if widths[k] > WIDEST:
-        raise ExpertError(f"{widths[k]:.3f} m wide where it would be taken, at most {WIDEST} m fit")
+        raise TooWideError(
+            f"{widths[k]:.3f} m wide where it would be taken, at most {WIDEST} m fit"
+        )
     across = np.array([-directions[1, k], directions[0, k]])
     middle = directions[:, k] * (along[:, k].max() + along[:, k].min()) / 2
     middle = middle + across * (part[:, :2] @ across).mean()
