@@ -52,7 +52,7 @@ _TRIES = 3  # initial states of the expert for each demonstration
 Row = tuple[dict[str, Any], LiberoResult]  # task, state and seed of an episode, what came of it
 
 
-def record_demonstrations(task: LiberoTask, count: int, folder: Path, watch: Watch) -> None:
+def _record(task: LiberoTask, count: int, folder: Path, watch: Watch) -> None:
     """Writes the expert's demonstrations of a task, from its last initial states downwards.
 
     States from which the expert doesn't succeed are left out. Raises `ExpertError` where too few
@@ -86,7 +86,7 @@ def demonstrations_of(task: LiberoTask, count: int, folder: Path, watch: Watch) 
         shown = read_demonstrations(folder, task=name)
         if len(shown) >= count:
             return shown.first(count)
-    record_demonstrations(task, count, folder, watch)
+    _record(task, count, folder, watch)
     return read_demonstrations(folder, task=name)
 
 
