@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import sys
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -60,8 +61,9 @@ def _quietly() -> contextlib.redirect_stdout:
 
 
 def _libero() -> tuple[Any, Any, Any]:
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+    if sys.platform == "linux":  # no window is needed
+        os.environ.setdefault("MUJOCO_GL", "egl")
+        os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     try:
         with _quietly():
             from libero.libero import benchmark, get_libero_path
@@ -100,11 +102,12 @@ class LiberoScene:
     """A task's simulation, looked at by cameras and moved by the benchmark's own controller.
 
     W is the simulation's world, z up. E is the hand's frame between the pads (robosuite's grip
-    site): z the way it approaches, x the way the fingers close.
+    site): z the way it approaches, x the way the fingers close. `seed` is of what the initial states
+    leave open: where furniture stands.
     """
 
     def __init__(self, task: LiberoTask, *, seed: int = 0):
-        self.task = task
+        self.task, self._seed = task, seed
         _, _, environment = _libero()
         with _quietly():
             self._env = environment(
@@ -138,6 +141,7 @@ class LiberoScene:
         if not 0 <= state < len(self.task.states):
             raise LiberoError(f"initial state {state}: 0 to {len(self.task.states) - 1} expected")
         with _quietly():
+            self._env.seed(self._seed)  # furniture is placed by it, not by the state
             self._env.reset()
             self._env.set_init_state(self.task.states[state])
         self._move_camera()
