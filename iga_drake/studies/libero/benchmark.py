@@ -102,8 +102,8 @@ class LiberoScene:
     """A task's simulation, looked at by cameras and moved by the benchmark's own controller.
 
     W is the simulation's world, z up. E is the hand's frame between the pads (robosuite's grip
-    site): z the way it approaches, x the way the fingers close. `seed` is of what the initial states
-    leave open: where furniture stands.
+    site): z the way it approaches, x the way the fingers close. `seed` is of what the initial
+    states leave open: where furniture stands.
     """
 
     def __init__(self, task: LiberoTask, *, seed: int = 0):

@@ -66,9 +66,10 @@ class LiberoResult:
     steps: int  # of 1/20 s after settling, until the benchmark called it done or it failed
     # Whether it still was done after the hand had let go and gone: more than the benchmark asks.
     stays: bool
-    # Of grasp and place, as far as they were asked: familiarity of both objects, probability and
-    # rank of the mode taken, seconds of inference.
+    # Of grasp and place, as far as they were asked: familiarity of both objects and confidence in
+    # the answer, where the aligner gives them, probability and rank of the mode taken, seconds.
     familiarity: list[list[float]] = field(default_factory=list)
+    confidence: list[float] = field(default_factory=list)
     probability: list[float] = field(default_factory=list)
     mode: list[int] = field(default_factory=list)
     inference_seconds: list[float] = field(default_factory=list)
@@ -206,6 +207,7 @@ class _Run:
         self.scene, self.shown, self.aligner, self.seed = scene, shown, aligner, seed
         self.hand, self.watch = _Hand(scene, limit), watch
         self.familiarity: list[list[float]] = []
+        self.confidence: list[float] = []
         self.probability: list[float] = []
         self.mode: list[int] = []
         self.inference: list[float] = []
@@ -240,6 +242,8 @@ class _Run:
         self.inference.append(time.perf_counter() - began)
         if estimate.familiarity is not None:
             self.familiarity.append(np.round(estimate.familiarity, 4).tolist())
+        if estimate.confidence is not None:
+            self.confidence.append(round(estimate.confidence, 4))
         gripper = self.shown.demonstrations[0].observations["gripper"].points
         for mode, X in enumerate(estimate.poses):
             if waypoint == GRASP:
@@ -313,6 +317,7 @@ def run_episode(
         steps=hand.done_after or hand.steps,
         stays=hand.done,
         familiarity=run.familiarity,
+        confidence=run.confidence,
         probability=run.probability,
         mode=run.mode,
         inference_seconds=[round(s, 3) for s in run.inference],
