@@ -15,7 +15,7 @@ _GAIN_SHIFT, _GAIN_TURN = 2.0, 1.0
 OPEN, CLOSED = -1.0, 1.0  # of the hand, as actions
 
 STANDOFF = 0.08  # m, from which a grasp is approached along E's z
-CLEARANCE = 0.10  # m above the place from which what is held is let down
+CLEARANCE = 0.10  # m above where it was taken or comes, at which what is held is carried
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # leaves the hand as it was
 
 
@@ -56,7 +56,7 @@ def raised(X: np.ndarray, z: float) -> np.ndarray:
 
 def grasp_way(grasp: np.ndarray, travel: float, carry: float) -> list[Stretch]:
     """From anywhere to the pose `grasp`, close, and up: at the height `travel` (m) before, at
-    `carry` after."""
+    `carry` after, and at least `CLEARANCE` above where it stood."""
     before = grasp.copy()
     before[:3, 3] -= STANDOFF * grasp[:3, 2]
     return [
@@ -64,7 +64,7 @@ def grasp_way(grasp: np.ndarray, travel: float, carry: float) -> list[Stretch]:
         Stretch(before, OPEN),
         Stretch(grasp, OPEN, exact=True),
         Stretch(grasp, CLOSED, wait=10),
-        Stretch(raised(grasp, carry), CLOSED),
+        Stretch(raised(grasp, max(carry, grasp[2, 3] + CLEARANCE)), CLOSED),
     ]
 
 
