@@ -25,6 +25,7 @@ from iga_drake.studies.libero.expert import (
     place_on,
 )
 from iga_drake.studies.libero.motion import (
+    CLEARANCES,
     Stretch,
     distance,
     grasp_way,
@@ -220,15 +221,16 @@ class _Run:
         self.watch(when, self.scene, views)
         return views
 
-    def pose(
+    def way(
         self,
         waypoint: int,
         grasped: np.ndarray,
         target: np.ndarray,
         grasped_up: np.ndarray | None,
-        ways: Callable[[np.ndarray], list[Stretch]],
-    ) -> np.ndarray:
-        """The pose X_WE of the best mode of which the whole way can be reached."""
+        way_to: Callable[[np.ndarray, float], list[Stretch]],
+    ) -> list[Stretch]:
+        """The way to the pose X_WE of the best mode that can be reached: with as much clearance as
+        the arm can reach, and at least with the least."""
         began = time.perf_counter()
         try:
             estimate = PoseEstimate.of(
@@ -251,10 +253,13 @@ class _Run:
             lowest = float((gripper @ X[2, :3]).min() + X[2, 3])
             if lowest < self.scene.ground - _PENETRATION:
                 continue
-            if all(self.scene.reachable(stretch.X_WE) for stretch in ways(X)):
-                self.mode.append(mode)
-                self.probability.append(round(float(estimate.probabilities[mode]), 4))
-                return X
+            if not self.scene.reachable(X):
+                continue
+            self.mode.append(mode)
+            self.probability.append(round(float(estimate.probabilities[mode]), 4))
+            ways = [way_to(X, clearance) for clearance in CLEARANCES]
+            whole = (w for w in ways if all(self.scene.reachable(part.X_WE) for part in w))
+            return next(whole, ways[-1])
         raise _Failure("alignment", f"none of {len(estimate.poses)} poses can be reached")
 
     def run(self) -> None:
@@ -264,10 +269,10 @@ class _Run:
         taken, goal = object_cloud(views, TAKEN, scene.taken), object_cloud(views, GOAL, scene.goal)
         gripper = self.shown.demonstrations[0].observations["gripper"].points
 
-        def grasping(X: np.ndarray) -> list[Stretch]:
-            return grasp_way(X, ground + TRAVEL, ground + CARRY)
+        def grasping(X: np.ndarray, clearance: float) -> list[Stretch]:
+            return grasp_way(X, ground + TRAVEL, ground + CARRY, clearance)
 
-        self.hand.follow(grasping(self.pose(GRASP, gripper, taken, None, grasping)))
+        self.hand.follow(self.way(GRASP, gripper, taken, None, grasping))
         views = self.views("held")
         if scene.opening < _EMPTY:
             raise _Failure("grasp", "the hand is closed on nothing")
@@ -276,11 +281,11 @@ class _Run:
         if nearest > _AWAY:
             raise _Failure("grasp", f"{scene.taken} is {nearest:.2f} m away from the hand")
 
-        def placing(X: np.ndarray) -> list[Stretch]:
-            return place_way(X, ground + CARRY)
+        def placing(X: np.ndarray, clearance: float) -> list[Stretch]:
+            return place_way(X, ground + CARRY, clearance)
 
         up = scene.X_WE[:3, :3].T @ UP
-        self.hand.follow(placing(self.pose(PLACE, held, goal, up / np.linalg.norm(up), placing)))
+        self.hand.follow(self.way(PLACE, held, goal, up / np.linalg.norm(up), placing))
 
 
 def run_episode(
