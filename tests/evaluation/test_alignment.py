@@ -8,7 +8,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from iga_drake import cli
 from iga_drake.aligners.iga.aligner import default_weights
+from iga_drake.aligners.peers.networks import landed_weights
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.checkpoint import load_checkpoint
 from iga_drake.dataset.alignment_error import (
@@ -218,3 +220,16 @@ def test_the_model_card_tells_what_the_file_says() -> None:
     text = model_card(default_weights(), [row])
     assert f"{card['samples_seen']:,} samples" in text
     assert row.rows() in text and "learning_rate" in text
+
+
+def test_the_model_card_of_a_peer_is_of_its_own_weights(tmp_path: Path, capsys) -> None:
+    path = tmp_path / "card.md"
+    options = ["--sets", "validation", "--count", "1", "--card", str(path)]
+    assert cli.main(["evaluate", "alignment", "--aligner", "reldist", *options]) == cli.SUCCESS
+    _, card = load_checkpoint(landed_weights("reldist"), kind="reldist")
+    text = path.read_text("utf-8")
+    assert text.startswith("# reldist.safetensors")
+    assert (
+        f"{card['samples_seen']:,} samples seen (every sample {card['training']['uses']} " in text
+    )
+    assert capsys.readouterr().out.splitlines()[1] in text

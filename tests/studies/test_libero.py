@@ -156,13 +156,13 @@ def test_a_grasp_is_approached_along_the_hand_and_closed_at_its_end() -> None:
     first = closed.index(True)
     np.testing.assert_array_equal(way[first].X_WE, X)
     before = np.linalg.inv(X) @ way[first - 2].X_WE
-    np.testing.assert_allclose(before[:3, 3], [0, 0, -motion.CLEARANCES[0]], atol=1e-12)
+    np.testing.assert_allclose(before[:3, 3], [0, 0, -motion.CLEARANCE], atol=1e-12)
     assert way[0].X_WE[2, 3] >= 0.2
     for carry in (0.3, -1.0):
         lifted = motion.grasp_way(X, 0.2, carry)[-1].X_WE[2, 3]
-        assert lifted >= max(carry, X[2, 3] + motion.CLEARANCES[0])
+        assert lifted >= max(carry, X[2, 3] + motion.CLEARANCE)
     placed = motion.place_way(X, 0.3)
-    assert placed[0].X_WE[2, 3] >= max(0.3, X[2, 3] + motion.CLEARANCES[0])
+    assert placed[0].X_WE[2, 3] >= max(0.3, X[2, 3] + motion.CLEARANCE)
     assert [s.hand == motion.OPEN for s in placed] == [False, False, True, True]
 
 

@@ -25,7 +25,6 @@ from iga_drake.studies.libero.expert import (
     place_on,
 )
 from iga_drake.studies.libero.motion import (
-    CLEARANCES,
     Stretch,
     distance,
     grasp_way,
@@ -43,6 +42,8 @@ TRAVEL, CARRY = 0.22, 0.32  # m above the ground, of E
 _OPENED, _SHUT = 0.08, 0.0  # m
 _STRETCH_STEPS = 50  # at most
 _EXACT, _ROUGH = (0.003, 0.02), (0.02, 0.1)  # m, rad from a stretch's end
+# A hand that in so many steps comes no nearer than this (m; a rad counts as `_LEVER`) stands still.
+_STALLED, _PROGRESS, _LEVER = 8, 0.002, 0.1
 _EMPTY = 0.003  # m between the pads of a hand that holds nothing
 _AWAY = 0.15  # m from E to the nearest point of an object that isn't held
 # Horizontal directions in W, from the middle of a vessel to where its rim is taken.
@@ -102,12 +103,17 @@ class _Hand:
             self.done_after = self.steps
 
     def follow(self, way: Sequence[Stretch]) -> None:
-        """Goes along the stretches; one whose end isn't reached in time is left for the next."""
+        """Goes along the stretches; one on which the hand comes no nearer to the end, as where the
+        arm doesn't reach so far up, is left for the next."""
         for stretch in way:
             shift, turn = _EXACT if stretch.exact else _ROUGH
+            before: list[float] = []
             for _ in range(_STRETCH_STEPS):
                 away = distance(self.scene.X_WE, stretch.X_WE)
                 if away[0] < shift and away[1] < turn:
+                    break
+                before.append(away[0] + _LEVER * away[1])
+                if len(before) > _STALLED and before[-1] > before[-1 - _STALLED] - _PROGRESS:
                     break
                 self._step(stretch)
             for _ in range(stretch.wait):
@@ -221,16 +227,14 @@ class _Run:
         self.watch(when, self.scene, views)
         return views
 
-    def way(
+    def pose(
         self,
         waypoint: int,
         grasped: np.ndarray,
         target: np.ndarray,
         grasped_up: np.ndarray | None,
-        way_to: Callable[[np.ndarray, float], list[Stretch]],
-    ) -> list[Stretch]:
-        """The way to the pose X_WE of the best mode that can be reached: with as much clearance as
-        the arm can reach, and at least with the least."""
+    ) -> np.ndarray:
+        """The pose X_WE of the best mode that the arm can reach."""
         began = time.perf_counter()
         try:
             estimate = PoseEstimate.of(
@@ -257,9 +261,7 @@ class _Run:
                 continue
             self.mode.append(mode)
             self.probability.append(round(float(estimate.probabilities[mode]), 4))
-            ways = [way_to(X, clearance) for clearance in CLEARANCES]
-            whole = (w for w in ways if all(self.scene.reachable(part.X_WE) for part in w))
-            return next(whole, ways[-1])
+            return X
         raise _Failure("alignment", f"none of {len(estimate.poses)} poses can be reached")
 
     def run(self) -> None:
@@ -269,10 +271,8 @@ class _Run:
         taken, goal = object_cloud(views, TAKEN, scene.taken), object_cloud(views, GOAL, scene.goal)
         gripper = self.shown.demonstrations[0].observations["gripper"].points
 
-        def grasping(X: np.ndarray, clearance: float) -> list[Stretch]:
-            return grasp_way(X, ground + TRAVEL, ground + CARRY, clearance)
-
-        self.hand.follow(self.way(GRASP, gripper, taken, None, grasping))
+        grasp = self.pose(GRASP, gripper, taken, None)
+        self.hand.follow(grasp_way(grasp, ground + TRAVEL, ground + CARRY))
         views = self.views("held")
         if scene.opening < _EMPTY:
             raise _Failure("grasp", "the hand is closed on nothing")
@@ -281,11 +281,9 @@ class _Run:
         if nearest > _AWAY:
             raise _Failure("grasp", f"{scene.taken} is {nearest:.2f} m away from the hand")
 
-        def placing(X: np.ndarray, clearance: float) -> list[Stretch]:
-            return place_way(X, ground + CARRY, clearance)
-
         up = scene.X_WE[:3, :3].T @ UP
-        self.hand.follow(self.way(PLACE, held, goal, up / np.linalg.norm(up), placing))
+        place = self.pose(PLACE, held, goal, up / np.linalg.norm(up))
+        self.hand.follow(place_way(place, ground + CARRY))
 
 
 def run_episode(

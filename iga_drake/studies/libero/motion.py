@@ -14,9 +14,9 @@ ACTION_SHIFT, ACTION_TURN = 0.05, 0.5  # m, rad
 _GAIN_SHIFT, _GAIN_TURN = 2.0, 1.0
 OPEN, CLOSED = -1.0, 1.0  # of the hand, as actions
 
-# m, from which a grasp is approached along E's z, and above which what is held is carried where it
-# stood or comes: the less the farther from the robot.
-CLEARANCES = (0.08, 0.05, 0.03)
+# m: a grasp is approached along E's z from so far, and what is held is carried so high above where
+# it stood and where it comes.
+CLEARANCE = 0.08
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # leaves the hand as it was
 
 
@@ -55,25 +55,23 @@ def raised(X: np.ndarray, z: float) -> np.ndarray:
     return X
 
 
-def grasp_way(
-    grasp: np.ndarray, travel: float, carry: float, clearance: float = CLEARANCES[0]
-) -> list[Stretch]:
+def grasp_way(grasp: np.ndarray, travel: float, carry: float) -> list[Stretch]:
     """From anywhere to the pose `grasp`, close, and up: at the height `travel` (m) before, at
-    `carry` after, and at least `clearance` (m) above where it stood."""
+    `carry` after, and at least `CLEARANCE` above where it stood."""
     before = grasp.copy()
-    before[:3, 3] -= clearance * grasp[:3, 2]
+    before[:3, 3] -= CLEARANCE * grasp[:3, 2]
     return [
         Stretch(raised(before, travel), OPEN),
         Stretch(before, OPEN),
         Stretch(grasp, OPEN, exact=True),
         Stretch(grasp, CLOSED, wait=10),
-        Stretch(raised(grasp, max(carry, grasp[2, 3] + clearance)), CLOSED),
+        Stretch(raised(grasp, max(carry, grasp[2, 3] + CLEARANCE)), CLOSED),
     ]
 
 
-def place_way(place: np.ndarray, carry: float, clearance: float = CLEARANCES[0]) -> list[Stretch]:
+def place_way(place: np.ndarray, carry: float) -> list[Stretch]:
     """From a held object at the height `carry` (m) to the pose `place`, open, and up."""
-    above = raised(place, max(carry, place[2, 3] + clearance))
+    above = raised(place, max(carry, place[2, 3] + CLEARANCE))
     return [
         Stretch(above, CLOSED),
         Stretch(place, CLOSED, exact=True),
