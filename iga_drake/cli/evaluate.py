@@ -33,6 +33,9 @@ SUBCOMMANDS = {
     "familiarity": Subcommand(
         "iga_drake.studies.familiarity", "how often own objects are refused, foreign ones accepted"
     ),
+    "libero": Subcommand(
+        "iga_drake.studies.libero.study", "LIBERO-PRO's pick-and-place, in MuJoCo"
+    ),
     "log": Subcommand("iga_drake.cli.evaluate_log", "poses inferred again from raw logs"),
     "moved-cameras": Subcommand(
         "iga_drake.studies.moved_cameras", "displacements of cameras that the arm's shape shows"

@@ -10,9 +10,9 @@ from pydrake.math import RigidTransform
 from pydrake.perception import PointCloud
 from pydrake.systems.framework import Context, LeafSystem, ValueProducer
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I
-from scipy.ndimage import binary_dilation
 
 from iga_drake.errors import IgaDrakeError, check_bounds, check_range, shortened
+from iga_drake.geometry.depth_images import unreliable_pixels
 from iga_drake.geometry.voxels import voxelize
 from iga_drake.systems.camera_agreement import DepthView, disagreeing
 from iga_drake.systems.ports import Role
@@ -156,26 +156,6 @@ class _Left:
             f"lie outside fusion.crop_lower to crop_upper, {box}, at {low} to {high} m: is it in "
             "the work area, and are the cameras' poses right?"
         )
-
-
-def unreliable_pixels(
-    depth: np.ndarray, label: np.ndarray, *, jump: float, erosion: int
-) -> np.ndarray:
-    """Pixels up to `erosion` px from a jump in depth or a border in the labels: (H, W) bool.
-
-    Depth there may be a mixture of foreground and background ("flying pixels"). `depth` (H, W) in
-    metres with NaN where there is none: a missing pixel by itself is no jump.
-    """
-    edges = np.zeros(depth.shape, dtype=bool)
-    if erosion == 0:
-        return edges
-    jumps = (np.abs(depth[:, 1:] - depth[:, :-1]) > jump) | (label[:, 1:] != label[:, :-1])
-    edges[:, 1:] |= jumps
-    edges[:, :-1] |= jumps
-    jumps = (np.abs(depth[1:] - depth[:-1]) > jump) | (label[1:] != label[:-1])
-    edges[1:] |= jumps
-    edges[:-1] |= jumps
-    return edges if erosion == 1 else binary_dilation(edges, iterations=erosion - 1)
 
 
 class PointCloudFusion(LeafSystem):

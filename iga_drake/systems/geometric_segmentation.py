@@ -16,6 +16,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from scipy.spatial.distance import pdist
 
 from iga_drake.errors import check_bounds, check_range
+from iga_drake.geometry.depth_images import unreliable_pixels
 from iga_drake.geometry.voxels import voxelize
 from iga_drake.systems.fusion import (
     FARTHEST,
@@ -24,7 +25,6 @@ from iga_drake.systems.fusion import (
     pixel_rays,
     pose_problem,
     time_problem,
-    unreliable_pixels,
 )
 from iga_drake.systems.ports import PANDA_JOINTS, Role
 from iga_drake.systems.self_filter import SelfFilter

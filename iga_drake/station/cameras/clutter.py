@@ -9,7 +9,8 @@ from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I
 from scipy.spatial import cKDTree
 
 from iga_drake.errors import check_bounds, check_range
-from iga_drake.systems.fusion import pixel_rays, unreliable_pixels
+from iga_drake.geometry.depth_images import unreliable_pixels
+from iga_drake.systems.fusion import pixel_rays
 from iga_drake.systems.ports import Role
 
 _JUMP = 0.02  # m between neighbours: pixels there may lie between the object and what is behind it
