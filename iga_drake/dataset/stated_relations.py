@@ -266,7 +266,7 @@ def _relation(where: str, entry: Any, objects: Mapping[str, StatedObject]) -> St
                     f"objects.{name}.instances.{key.rpartition('/')[2]}.frames"
                 )
         ends.append((name, frame))
-    return StatedRelation(*ends, *_place(where, entry), *_place(where, entry, "vary_"))
+    return StatedRelation(ends[0], ends[1], *_place(where, entry), *_place(where, entry, "vary_"))
 
 
 def _place(where: str, entry: Mapping[str, Any], prefix: str = "") -> tuple[np.ndarray, np.ndarray]:
