@@ -38,6 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--unit", type=float, default=1.0, help="metres per unit of --meshes (default 1)"
     )
     parser.add_argument(
+        "--lift", type=float, default=0.02, metavar="M",
+        help="an object that overlaps something where it is put is lifted by so much at most "
+        "(default 0.02)",
+    )  # fmt: skip
+    parser.add_argument(
         "--results", type=results_file, help="results file to append to and go on from"
     )
     parser.add_argument("--json", action="store_true", help="print the rows as JSON")
@@ -64,6 +69,7 @@ def run(arguments: argparse.Namespace) -> None:
             demonstrations=arguments.demonstrations,
             meshes=arguments.meshes,
             unit=arguments.unit,
+            lift=arguments.lift,
         )
         for name in arguments.relations
         for poses in arguments.poses

@@ -1,6 +1,7 @@
 """Whether an object stays where it is put on, in or at another one: judged by physics, no robot.
 
-The target stands fixed on a table. The object, a free body, starts at its pose at rest; then the
+The target stands fixed on a table. The object, a free body, starts at rest at its pose, or where it
+overlaps something as little above it as it has to: a hand that lowers it would stop there. Then the
 same with gravity turned upwards, as if both were turned upside down, from where it has come to.
 """
 
@@ -28,6 +29,7 @@ _SETTLE, _FALL = 2.0, 2.5  # s, at most: free at the pose; upside down
 _STEP, _EARLIEST = 0.1, 0.3  # s: between looks at it, and until the first
 _RESTS = 0.002  # m/s and rad/s, of an object that has come to rest
 _FALLEN = 0.04  # m, that an object falls off by when turned upside down, at least
+_LIFT_STEP, _OVERLAP = 0.001, 0.001  # m: of lifts that are tried; that two things may overlap by
 _TOUCH = 0.001  # m between two things that touch
 _FRICTION = 0.2  # of all objects: of glazed pottery and plastic
 _GRAVITY = 9.81
@@ -51,6 +53,7 @@ def judge_placing(
     folder: Path,
     *,
     most_tilt: float | None = None,
+    lift: float = 0.0,
 ) -> Placing:
     """What becomes of A at X_BA (4, 4) when B stands fixed on z = 0.
 
@@ -59,9 +62,12 @@ def judge_placing(
 
     Args:
       folder: where meshes are written.
+      lift: m, that it may be lifted by at most at the start.
     """
     start = RigidTransform(RotationMatrix.ProjectToRotationMatrix(X_BA[:3, :3]), X_BA[:3, 3])
-    rest, touches, on_table = _simulate(grasped, target, start, folder, -_GRAVITY, _SETTLE)
+    rest, touches, on_table = _simulate(
+        grasped, target, start, folder, -_GRAVITY, _SETTLE, lift=lift
+    )
     tilt = float(np.arccos(np.clip(rest.rotation().matrix()[2, 2], -1, 1)))
     moved = float(np.linalg.norm(rest.translation() - start.translation()))
     if on_table:
@@ -83,6 +89,8 @@ def _simulate(
     folder: Path,
     gravity: float,
     seconds: float,
+    *,
+    lift: float = 0.0,
 ) -> tuple[RigidTransform, bool, bool]:
     """A's pose in the end, and whether it touches B, and the table, then.
 
@@ -104,7 +112,6 @@ def _simulate(
         (instance,) = Parser(plant).AddModelsFromString(text, "sdf")
         bodies[name] = plant.GetBodyByName(name, instance)
     plant.WeldFrames(plant.world_frame(), bodies[_TARGET].body_frame())
-    plant.SetDefaultFloatingBaseBodyPose(bodies[_GRASPED], start)
     bodies[_TABLE] = plant.world_body()
     if gravity < 0:
         plant.RegisterCollisionGeometry(
@@ -118,7 +125,7 @@ def _simulate(
     plant.Finalize()
     diagram = builder.Build()
     simulator = Simulator(diagram)
-    context = plant.GetMyContextFromRoot(simulator.get_context())
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     owners = {
         geometry: name
         for name, body in bodies.items()
@@ -131,14 +138,20 @@ def _simulate(
         return {frozenset((owners[pair.id_A], owners[pair.id_B])) for pair in pairs}
 
     body = bodies[_GRASPED]
+    for height in np.arange(0.0, lift + _LIFT_STEP / 2, _LIFT_STEP):
+        plant.SetFreeBodyPose(context, body, RigidTransform([0.0, 0.0, height]) @ start)
+        query = plant.get_geometry_query_input_port().Eval(context)
+        if all(pair.depth <= _OVERLAP for pair in query.ComputePointPairPenetration()):
+            break
+    else:
+        plant.SetFreeBodyPose(context, body, start)
     both, floor = frozenset((_GRASPED, _TARGET)), frozenset((_GRASPED, _TABLE))
     for time in np.arange(_EARLIEST, seconds + _STEP / 2, _STEP):
         simulator.AdvanceTo(time)
         V_WO = plant.EvalBodySpatialVelocityInWorld(context, body).get_coeffs()
         risen = plant.EvalBodyPoseInWorld(context, body).translation()[2] - start.translation()[2]
-        if np.abs(V_WO).max() < _RESTS or (
-            gravity > 0 and risen > _FALLEN and both not in touched()
-        ):
+        fallen = gravity > 0 and risen > _FALLEN and both not in touched()
+        if fallen or np.abs(V_WO).max() < _RESTS:
             break
     pairs = touched()
     return plant.EvalBodyPoseInWorld(context, body), both in pairs, floor in pairs

@@ -195,25 +195,33 @@ def _stood(height: float) -> np.ndarray:
 
 def lowered(grasped: ShapeInstance, target: ShapeInstance) -> float:
     """Height (m) of A's origin on B's z axis, both upright, at which A, let down, meets B."""
-    top, bottom = _heights(target, np.fmax, -np.inf), _heights(grasped, np.fmin, np.inf)
-    cells = top.keys() & bottom.keys()
-    return max((top[cell] - bottom[cell] for cell in cells), default=0.0)
+    (cells_B, top), (cells_A, bottom) = _heights(target, np.fmax), _heights(grasped, np.fmin)
+    _, at_A, at_B = np.intersect1d(cells_A, cells_B, assume_unique=True, return_indices=True)
+    return float((top[at_B] - bottom[at_A]).max()) if len(at_A) else 0.0
 
 
 def lowered_floor(target: ShapeInstance) -> float:
     """Height (m) of a container's inner floor in its middle."""
-    top = _heights(target, np.fmax, -np.inf)
-    return min((z for (x, y), z in top.items() if abs(x) <= 3 and abs(y) <= 3), default=0.0)
+    points = _samples(target)
+    middle = np.abs(points[:, :2]).max(1) < 3 * _CELL
+    cells, top = _heights(target, np.fmax)
+    inner = np.isin(cells, _cells(points[middle]))
+    return float(top[inner].min()) if inner.any() else 0.0
 
 
-def _heights(shape: ShapeInstance, better: np.ufunc, worst: float) -> dict[tuple[int, int], float]:
-    """The highest or lowest z (m) of a surface in every cell of x and y that it is over."""
+def _cells(points: np.ndarray) -> np.ndarray:
+    """The number (n,) of the cell of x and y that each point (n, 3) is over."""
+    x, y = np.floor(points[:, :2] / (1.5 * _CELL)).astype(np.int64).T
+    return x * (1 << 20) + y
+
+
+def _heights(shape: ShapeInstance, better: np.ufunc) -> tuple[np.ndarray, np.ndarray]:
+    """The cells (n,) that a surface is over, and its highest or lowest z (n,) m there."""
     points = _samples(shape)
-    cells = np.floor(points[:, :2] / (1.5 * _CELL)).astype(np.int64)
-    unique, index = np.unique(cells, axis=0, return_inverse=True)
-    values = np.full(len(unique), worst)
+    cells, index = np.unique(_cells(points), return_inverse=True)
+    values = np.full(len(cells), np.nan)
     better.at(values, index.reshape(-1), points[:, 2])
-    return {(int(x), int(y)): float(z) for (x, y), z in zip(unique, values, strict=True)}
+    return cells, values
 
 
 def _samples(shape: ShapeInstance) -> np.ndarray:
@@ -283,10 +291,10 @@ def handle_hole(mug: ShapeInstance) -> tuple[np.ndarray, float] | None:
         at = np.unravel_index(int(depth.argmax()), depth.shape)
         if best is None or depth[at] > best[0]:
             place = low + (np.array(at) + 0.5) * _CELL
-            side = 1 if place[0] > 0 else -1
+            step = 1 if place[0] > 0 else -1
             row = inside[:, at[1]] > 0
             steps = 0
-            while row[at[0] + side * (steps + 1)]:
+            while row[at[0] + step * (steps + 1)]:
                 steps += 1
             best = (float(depth[at]), float(turn), place, (steps + 0.5) * _CELL)
     if best is None or best[0] * _CELL < 0.004:

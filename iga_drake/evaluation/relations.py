@@ -82,11 +82,13 @@ class RelationTest:
         demonstrations: int = 10,
         meshes: str = "",
         unit: float = 1.0,
+        lift: float = 0.02,
     ) -> None:
         """Args:
         poses: of the objects when they are seen, one of POSES.
         demonstrations: how many; the same ones in all trials, seen anew in each.
         meshes, unit: see `RelationObjects`.
+        lift: see `judge_placing`.
 
         Raises `IgaDrakeError` for an unknown value, and where there are no objects.
         """
@@ -97,7 +99,9 @@ class RelationTest:
         self.relation, self.poses, self.count = relation, poses, demonstrations
         self.objects = RelationObjects(meshes, unit)
         self.objects.check(relation)
-        self._meshes, self._unit = meshes, unit
+        if not 0 <= lift < 1:
+            raise IgaDrakeError(f"lift {lift}: 0 or more is expected (m)")
+        self._meshes, self._unit, self._lift = meshes, unit, lift
         self._shown: list[PlacedPair] = []
 
     @property
@@ -168,6 +172,7 @@ class RelationTest:
             "demonstrations": self.count,
             "meshes": collection_digest(self._meshes) if self._meshes else "",
             "unit": self._unit,
+            "lift": self._lift,
             **aligner_key(aligner, name, options),
             "code": code_key(aligner),
         }
@@ -194,6 +199,7 @@ class RelationTest:
             X_BA,
             cache_dir() / "task_meshes",
             most_tilt=MOST_TILT if self.relation.upright else None,
+            lift=self._lift,
         )
 
     def _rng(self, seed: int, stream: int) -> np.random.Generator:
