@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 _HEAD = (
-    f"{'relation':<20} {'poses':<9} {'objects':<9} {'aligner':<10} {'success':>9}  "
+    f"{'relation':<20} {'poses':<9} {'objects':<29} {'aligner':<10} {'success':>9}  "
     f"{'95 % (Wilson)':>13}  {'off':>7}  {'s':>6}  {'R-NDF, published':>16}  failures"
 )
 
@@ -103,7 +103,7 @@ def _line(row: dict) -> str:
     causes = ", ".join(f"{count} {cause}" for cause, count in row["causes"].items())
     reused = f"  ({row['reused']} reused)" if row["reused"] else ""
     return (
-        f"{row['relation']:<20} {row['poses']:<9} {row['objects']:<9} {row['aligner']:<10} "
+        f"{row['relation']:<20} {row['poses']:<9} {row['objects']:<29} {row['aligner']:<10} "
         f"{row['successes']:>3} / {row['trials']:<3}  {100 * low:>4.0f} - {100 * high:>3.0f} %  "
         f"{100 * row['median_translation_m']:>4.1f} cm  {row['median_inference_s']:>6.2f}  "
         f"{100 * row['published_rndf']:>14.0f} %  {causes}{reused}"

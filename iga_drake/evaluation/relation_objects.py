@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -206,7 +207,7 @@ def lowered_floor(target: ShapeInstance) -> float:
     middle = np.abs(points[:, :2]).max(1) < 3 * _CELL
     cells, top = _heights(target, np.fmax)
     inner = np.isin(cells, _cells(points[middle]))
-    return float(top[inner].min()) if inner.any() else 0.0
+    return float(np.median(top[inner])) if inner.any() else 0.0
 
 
 def _cells(points: np.ndarray) -> np.ndarray:
@@ -274,39 +275,55 @@ def handle_hole(mug: ShapeInstance) -> tuple[np.ndarray, float] | None:
     through it, and how far (m) it goes along x from there; None where no hole is seen."""
     points = _samples(mug)
     middle = (points.min(0) + points.max(0)) / 2
-    best: tuple[float, float, np.ndarray, float] | None = None
-    # Our families' handles are in the plane of x and z.
-    for turn in _TURNS[:1] if "handle" in mug.frames else _TURNS:
-        c, s = np.cos(turn), np.sin(turn)
-        flat = np.column_stack(((points - middle) @ [c, s, 0.0], points[:, 2]))
-        low = flat.min(0) - 3 * _CELL
-        index = ((flat - low) / _CELL).astype(np.int64)
-        filled = np.zeros(index.max(0) + 4, bool)
-        filled[tuple(index.T)] = True
-        labels, count = ndimage.label(~filled)
-        if count < 2:  # the outside alone
-            continue
-        inside = np.where(labels == labels[0, 0], 0, labels)
-        depth = ndimage.distance_transform_edt(inside > 0)
-        at = np.unravel_index(int(depth.argmax()), depth.shape)
-        if best is None or depth[at] > best[0]:
-            place = low + (np.array(at) + 0.5) * _CELL
-            step = 1 if place[0] > 0 else -1
-            row = inside[:, at[1]] > 0
-            steps = 0
-            while row[at[0] + step * (steps + 1)]:
-                steps += 1
-            best = (float(depth[at]), float(turn), place, (steps + 0.5) * _CELL)
-    if best is None or best[0] * _CELL < 0.004:
+    turn = 0.0  # our families' handles are in the plane of x and z
+    if "handle" not in mug.frames:
+        seen = [_silhouette_hole(points - middle, each) for each in _TURNS]
+        areas = np.array([0.0 if hole is None else hole.area for hole in seen])
+        widest = areas >= 0.95 * areas.max()
+        turn = float(np.angle(np.exp(2j * _TURNS[widest]).sum())) / 2
+    hole = _silhouette_hole(points - middle, turn)
+    if hole is None or hole.radius < 0.004:
         return None
-    _, turn, place, outwards = best
-    side = 1.0 if place[0] > 0 else -1.0
-    along = np.array([np.cos(turn), np.sin(turn), 0.0])
-    x = side * along
+    x = hole.side * np.array([np.cos(turn), np.sin(turn), 0.0])
     y = np.cross([0.0, 0.0, 1.0], x)
-    beyond = (points - middle) @ x > abs(place[0])
-    across = float(((points[beyond] - middle) @ y).mean())
+    beyond = (points - middle) @ x > hole.along
     X = np.eye(4)
     X[:3, :3] = np.column_stack((x, y, [0.0, 0.0, 1.0]))
-    X[:3, 3] = [*(middle + place[0] * along + across * y)[:2], place[1]]
-    return X, outwards
+    X[:3, 3] = middle + hole.along * x + ((points[beyond] - middle) @ y).mean() * y
+    X[2, 3] = middle[2] + hole.height
+    return X, hole.outwards
+
+
+class _Hole(NamedTuple):
+    """The widest hole in a silhouette, in the plane that it is seen in."""
+
+    area: float  # m^2
+    radius: float  # m, of the largest disc in it
+    side: float  # 1 or -1, on which side of the middle that disc is
+    along: float  # m, how far from the middle
+    height: float  # m, above the middle
+    outwards: float  # m, from the disc's middle away from the silhouette's
+
+
+def _silhouette_hole(points: np.ndarray, turn: float) -> _Hole | None:
+    """The widest hole that is seen in points (n, 3) across a level direction `turn` (rad)."""
+    flat = np.column_stack((points @ [np.cos(turn), np.sin(turn), 0.0], points[:, 2]))
+    low = flat.min(0) - 3 * _CELL
+    index = ((flat - low) / _CELL).astype(np.int64)
+    filled = np.zeros(index.max(0) + 4, bool)
+    filled[tuple(index.T)] = True
+    labels, count = ndimage.label(~filled)
+    inside = (labels > 0) & (labels != labels[0, 0])
+    if count < 2 or not inside.any():  # the outside alone
+        return None
+    depth = ndimage.distance_transform_edt(inside)
+    i, j = np.unravel_index(int(depth.argmax()), depth.shape)
+    along, height = low + (np.array([i, j]) + 0.5) * _CELL
+    step, steps = (1 if along > 0 else -1), 0
+    while inside[i + step * (steps + 1), j]:
+        steps += 1
+    area = float((labels == labels[i, j]).sum()) * _CELL**2
+    return _Hole(
+        area, float(depth[i, j]) * _CELL, float(step), abs(float(along)), float(height),
+        (steps + 0.5) * _CELL,
+    )  # fmt: skip
