@@ -9,6 +9,7 @@ up; with `arbitrary` both are in any orientation, seen from anywhere, and it is 
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from time import perf_counter
 from typing import Any
 
@@ -102,7 +103,6 @@ class RelationTest:
         if not 0 <= lift < 1:
             raise IgaDrakeError(f"lift {lift}: 0 or more is expected (m)")
         self._meshes, self._unit, self._lift = meshes, unit, lift
-        self._shown: list[PlacedPair] = []
 
     @property
     def source(self) -> str:
@@ -135,7 +135,8 @@ class RelationTest:
         """The question about a test pair, and the poses X_WA, X_WB (4, 4) in which its cloud of A
         would be right beside that of B."""
         rng = self._rng(seed, 1)
-        pairs = [*self._demonstrations(), pair]
+        shown = _demonstrations(self.relation, self.count, self._meshes, self._unit)
+        pairs = [*shown, pair]
         clouds, ups, poses = [], [], []
         for n, each in enumerate(pairs):
             anyhow = self.poses == "arbitrary" and n == len(pairs) - 1
@@ -177,34 +178,45 @@ class RelationTest:
             "code": code_key(aligner),
         }
 
-    def _demonstrations(self) -> list[PlacedPair]:
-        """Pairs of the demonstrations' instances that hold in the simulation."""
-        seed = 0
-        while len(self._shown) < self.count:
-            pair = self.objects.draw(self.relation, DEMONSTRATION, self._rng(seed, 2))
-            if self._judge(pair, pair.X_BA).success:
-                self._shown.append(pair)
-            seed += 1
-            if seed > _DEMONSTRATION_TRIES * self.count:
-                raise IgaDrakeError(
-                    f"{self.relation.name}: {len(self._shown)} of {seed} demonstrations held, "
-                    f"{self.count} are needed: give other meshes, or ask for fewer"
-                )
-        return self._shown
-
     def _judge(self, pair: PlacedPair, X_BA: np.ndarray) -> Placing:
-        return judge_placing(
-            pair.grasped,
-            pair.target,
-            X_BA,
-            cache_dir() / "task_meshes",
-            most_tilt=MOST_TILT if self.relation.upright else None,
-            lift=self._lift,
-        )
+        return _judge(self.relation, pair, X_BA, self._lift)
 
     def _rng(self, seed: int, stream: int) -> np.random.Generator:
-        """Objects are the same for all poses and aligners."""
-        return np.random.default_rng([zlib.crc32(self.relation.name.encode()), seed, stream])
+        return _rng(self.relation, seed, stream)
+
+
+@lru_cache(maxsize=8)
+def _demonstrations(
+    relation: PlacingRelation, count: int, meshes: str, unit: float
+) -> tuple[PlacedPair, ...]:
+    """Pairs of the demonstrations' instances that hold in the simulation where they belong."""
+    objects, shown = RelationObjects(meshes, unit), []
+    for seed in range(_DEMONSTRATION_TRIES * count):
+        pair = objects.draw(relation, DEMONSTRATION, _rng(relation, seed, 2))
+        if _judge(relation, pair, pair.X_BA, 0.0).success:
+            shown.append(pair)
+        if len(shown) == count:
+            return tuple(shown)
+    raise IgaDrakeError(
+        f"{relation.name}: {len(shown)} of {_DEMONSTRATION_TRIES * count} demonstrations held, "
+        f"{count} are needed: give other meshes, or ask for fewer"
+    )
+
+
+def _judge(relation: PlacingRelation, pair: PlacedPair, X_BA: np.ndarray, lift: float) -> Placing:
+    return judge_placing(
+        pair.grasped,
+        pair.target,
+        X_BA,
+        cache_dir() / "task_meshes",
+        most_tilt=MOST_TILT if relation.upright else None,
+        lift=lift,
+    )
+
+
+def _rng(relation: PlacingRelation, seed: int, stream: int) -> np.random.Generator:
+    """Objects are the same for all poses and aligners."""
+    return np.random.default_rng([zlib.crc32(relation.name.encode()), seed, stream])
 
 
 def _cloud(
