@@ -5,6 +5,7 @@ overlaps something as little above it as it has to: a hand that lowers it would 
 same with gravity turned upwards, as if both were turned upside down, from where it has come to.
 """
 
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,7 +51,6 @@ def judge_placing(
     grasped: ShapeInstance,
     target: ShapeInstance,
     X_BA: np.ndarray,
-    folder: Path,
     *,
     most_tilt: float | None = None,
     lift: float = 0.0,
@@ -61,9 +61,21 @@ def judge_placing(
     (rad) of the vertical (None: any way), and if it falls off when both are turned upside down.
 
     Args:
-      folder: where meshes are written.
+      most_tilt: rad.
       lift: m, that it may be lifted by at most at the start.
     """
+    with tempfile.TemporaryDirectory() as folder:  # of meshes
+        return _judged(grasped, target, X_BA, Path(folder), most_tilt, lift)
+
+
+def _judged(
+    grasped: ShapeInstance,
+    target: ShapeInstance,
+    X_BA: np.ndarray,
+    folder: Path,
+    most_tilt: float | None,
+    lift: float,
+) -> Placing:
     start = RigidTransform(RotationMatrix.ProjectToRotationMatrix(X_BA[:3, :3]), X_BA[:3, 3])
     rest, touches, on_table = _simulate(
         grasped, target, start, folder, -_GRAVITY, _SETTLE, lift=lift

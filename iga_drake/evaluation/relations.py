@@ -36,7 +36,6 @@ from iga_drake.evaluation.relation_objects import (
 )
 from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key
 from iga_drake.evaluation.task_success import wilson_interval
-from iga_drake.paths import cache_dir
 from iga_drake.progress import progress
 from iga_drake.shapes.instance import ShapeInstance
 
@@ -208,7 +207,6 @@ def _judge(relation: PlacingRelation, pair: PlacedPair, X_BA: np.ndarray, lift: 
         pair.grasped,
         pair.target,
         X_BA,
-        cache_dir() / "task_meshes",
         most_tilt=MOST_TILT if relation.upright else None,
         lift=lift,
     )

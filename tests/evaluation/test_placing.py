@@ -78,8 +78,8 @@ BLOCK = _solid(_box(0.05, 0.05, 0.08))
     ],
     ids=["inside", "beside", "lifted", "in the wall"],
 )
-def test_a_block_in_a_tray(tmp_path: Path, X_BA: np.ndarray, lift: float, cause: str) -> None:
-    placing = judge_placing(BLOCK, _tray(), X_BA, tmp_path, most_tilt=MOST_TILT, lift=lift)
+def test_a_block_in_a_tray(X_BA: np.ndarray, lift: float, cause: str) -> None:
+    placing = judge_placing(BLOCK, _tray(), X_BA, most_tilt=MOST_TILT, lift=lift)
     if cause == "stuck":  # or pushed out of the wall to the other side
         assert not placing.success
     else:
@@ -90,13 +90,13 @@ def test_a_block_in_a_tray(tmp_path: Path, X_BA: np.ndarray, lift: float, cause:
         )
 
 
-def test_what_lies_is_tilted_and_what_floats_falls(tmp_path: Path) -> None:
+def test_what_lies_is_tilted_and_what_floats_falls() -> None:
     base = _solid(_box(0.2, 0.2, 0.02, at=(0, 0, 0.01)))
     lying = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0.046], [0, 0, 0, 1]])
-    placing = judge_placing(BLOCK, base, lying, tmp_path, most_tilt=MOST_TILT)
+    placing = judge_placing(BLOCK, base, lying, most_tilt=MOST_TILT)
     assert placing.cause == "tilted" and placing.tilt == pytest.approx(np.pi / 2, abs=0.02)
-    assert judge_placing(BLOCK, base, lying, tmp_path).success  # any way up is right
-    placing = judge_placing(BLOCK, base, _at(0, 0, 0.08), tmp_path, most_tilt=MOST_TILT)
+    assert judge_placing(BLOCK, base, lying).success  # any way up is right
+    placing = judge_placing(BLOCK, base, _at(0, 0, 0.08), most_tilt=MOST_TILT)
     assert placing.success and placing.moved == pytest.approx(0.02, abs=0.002)
 
 
