@@ -113,6 +113,9 @@ class Sample:
     canonical_surface: np.ndarray = field(
         default_factory=lambda: np.empty((2, 0, 2, 3), np.float32)
     )
+    # (2, S, 2, 3) m: evenly dense points and normals of the canonical instances, in their frames;
+    # S = 0 but for meshes in their own sizes.
+    form: np.ndarray = field(default_factory=lambda: np.empty((2, 0, 2, 3), np.float32))
 
     @property
     def symmetries(self) -> tuple[Symmetry, Symmetry]:
@@ -143,8 +146,9 @@ class Sample:
         own = find_symmetries(*np.moveaxis(self.surface[role], 1, 0), tolerance=tolerance)
         if self.category[role] in FAMILIES or not self.canonical_surface.shape[1]:
             return own
-        points, normals = np.moveaxis(self.canonical_surface[role], 1, 0)
-        turns = find_symmetries(points, normals, tolerance=tolerance)[1:]
+        form = self.form if self.form.shape[1] else self.canonical_surface
+        turns = find_symmetries(*np.moveaxis(form[role], 1, 0), tolerance=tolerance)[1:]
+        points = self.canonical_surface[role, :, 0]
         return np.concatenate((own, _carried(turns, points, self.surface[role, :, 0])))
 
 
@@ -169,6 +173,7 @@ class _Object:
     spacing: np.ndarray  # (N + 1,) m between neighbouring points
     axis: np.ndarray  # (2, 3) of the test instance: point and direction
     up: np.ndarray  # (3,) in every instance's own frame, or 0
+    form: np.ndarray | None = None  # (S, 2, 3), see `Sample.form`
     corresponding: bool = True  # whether the points are the same on all instances
 
 
@@ -298,7 +303,12 @@ def _instances(chosen: SampleSet, k: int, role: int, config: SampleConfig) -> _O
         up *= related_pairs(chosen, k, SIZE).relation.upright[role]
     elif category == COMPOSITE or lies.random() >= STANDING:
         up = _direction(lies)
-    return _Object(category, *surface, axis, up)
+    form = None
+    if config.mesh_unit and category not in FAMILIES:
+        even = chosen.rng("instances", k, role, chosen.pairs + 3)
+        points, normals, _ = surface_points(even, vertices[:1], faces, config.surface_points)
+        form = np.stack((points[0], normals[0]), 1)
+    return _Object(category, *surface, axis, up, form)
 
 
 def _stated(
@@ -631,6 +641,9 @@ def _observe(
     test_A, test_B = poses[:, -1]
     surface = np.stack((points[-1], normals[-1]), 2).astype(np.float32)
     canonical_surface = np.stack([np.stack((o.points[0], o.normals[0]), 1) for o in objects])
+    forms = [shape.form for shape in objects if shape.form is not None]
+    if len(forms) < 2 or not config.test_surface:
+        forms = [np.empty((0, 2, 3))] * 2
     if not config.test_surface:
         surface = surface[:, :0]
     if not config.test_surface or not all(shape.corresponding for shape in objects):
@@ -648,6 +661,7 @@ def _observe(
         category=(objects[0].category, objects[1].category),
         surface=surface,
         canonical_surface=canonical_surface.astype(np.float32),
+        form=np.stack(forms).astype(np.float32),
     )
 
 
