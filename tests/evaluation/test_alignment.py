@@ -246,6 +246,7 @@ def test_errors_on_own_objects_are_taken_at_tolerances_and_kept_by_content(tmp_p
     angles = Rotation.from_matrix(turns[:, :3, :3]).magnitude()
     turn = turns[np.abs(angles - np.pi / 2).argmin()]
     aligner = _Fixed(turn)
+    aligner.name = "turned"
     row, _ = evaluate_alignment(aligner, split, 1, **arguments)
     assert row.at["5mm"].rotation_mean < 1 and row.at["1mm"].rotation_mean > 70
     again, _ = evaluate_alignment(aligner, split, 1, **arguments)
