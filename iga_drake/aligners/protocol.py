@@ -32,7 +32,7 @@ class PoseEstimate:
     """Poses `X_WF` best first, with their energies and the probability of each mode.
 
     Raises `AlignerError` where a shape is wrong, a number isn't finite, a pose isn't rigid (within
-    1e-6), a probability is below 0, or the familiarity lies outside of [0, 1].
+    1e-6), a probability is below 0, or familiarity or confidence lie outside of [0, 1].
     """
 
     poses: np.ndarray  # (M, 4, 4) float64
@@ -41,6 +41,8 @@ class PoseEstimate:
     # (2,) how sure it is that the demonstrations show objects like the grasped one and the target,
     # from 0 to 1; one half or more counts as known. None where the aligner can't tell.
     familiarity: np.ndarray | None = None
+    # Probability, from 0 to 1, that the best pose is right. None where the aligner can't tell.
+    confidence: float | None = None
 
     def __post_init__(self) -> None:
         poses = self._numbers("poses")
@@ -80,6 +82,14 @@ class PoseEstimate:
                     "to 1 (of the grasped object and of the target), or None, expected"
                 )
             object.__setattr__(self, "familiarity", familiarity)
+        if self.confidence is not None:
+            confidence = self._numbers("confidence")
+            if confidence.shape != () or not 0 <= confidence <= 1:
+                raise AlignerError(
+                    f"PoseEstimate.confidence: {shortened(self.confidence)}, a number from 0 to 1, "
+                    "or None, expected"
+                )
+            object.__setattr__(self, "confidence", float(confidence))
 
     def _numbers(self, name: str) -> np.ndarray:
         """The field as float64."""
@@ -104,7 +114,11 @@ class PoseEstimate:
                 f"{', '.join(missing)})"
             )
         return PoseEstimate(
-            found.poses, found.energies, found.probabilities, getattr(found, "familiarity", None)
+            found.poses,
+            found.energies,
+            found.probabilities,
+            getattr(found, "familiarity", None),
+            getattr(found, "confidence", None),
         )
 
 

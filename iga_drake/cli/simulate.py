@@ -138,7 +138,7 @@ def _simulate(
     """Runs one episode, which `buttons` may pause or end early; tells how it goes, writes what was
     asked for and returns the exit status."""
     from iga_drake.tasks.episode import Episode
-    from iga_drake.tasks.frames import FrameStrip
+    from iga_drake.tasks.frames import FrameStrip, replay_poster
 
     live, split = buttons is not None, arguments.split
     if meshcat is not None:
@@ -153,6 +153,7 @@ def _simulate(
             used = len(episode.demonstrations)
             print(f"    the first {used} demonstrations of {arguments.demonstrations}", flush=True)
         strip = FrameStrip(episode) if arguments.png else None
+        poster = replay_poster(episode) if arguments.html else None
 
         def tell(line: str) -> None:
             print(line, flush=True)
@@ -177,7 +178,7 @@ def _simulate(
         show_verdict(meshcat, str(result), experts, result.simulated_seconds)
         end_recording(meshcat)
         if arguments.html:
-            write_text(arguments.html, replay_html(meshcat, result.row()))
+            write_text(arguments.html, replay_html(meshcat, result.row(), poster))
             print(f"replay: {arguments.html}")
     if arguments.result:
         write_text(arguments.result, json.dumps(result.row()) + "\n")

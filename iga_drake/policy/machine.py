@@ -87,6 +87,8 @@ class PolicyConfig:
     # Least `PoseEstimate.familiarity` of both objects, in [0, 1]: below it the policy refuses. 0
     # refuses nothing.
     minimum_familiarity: float = 0.5
+    # Least `PoseEstimate.confidence`, in [0, 1]: below it the policy refuses. 0 refuses nothing.
+    minimum_confidence: float = 0.1
     # Whether aligners are told which way is up for the objects that the task says are upright
     # (`ObservationPlan.upright`), where all demonstrations say so too. To be switched off where
     # such objects may lie on their side; demonstrations recorded then don't call them upright.
@@ -101,6 +103,7 @@ class PolicyConfig:
             "minimum_points": (0, 100_000),
             "infer_delay": (0.0, 60.0),
             "minimum_familiarity": (0.0, 1.0),
+            "minimum_confidence": (0.0, 1.0),
         }
         for name in ("observe_limit", "present_limit", "move_limit", "infer_limit"):
             bounds[name] = (1e-9, 3600.0)
@@ -466,6 +469,14 @@ class PolicyMachine:
                     "with such objects, or ask for less (policy.minimum_familiarity)",
                     Cause.ALIGNMENT,
                 )
+        least, sure = config.minimum_confidence, estimate.confidence
+        if sure is not None and not sure >= least:
+            raise Refusal(
+                f"aligner {self.inference.name}: its pose is right with a probability of "
+                f"{sure:.2f} alone; at least {least:g} is asked for: look again, demonstrate more "
+                "alike, or ask for less (policy.minimum_confidence)",
+                Cause.ALIGNMENT,
+            )
         # The arm comes from the waypoint before, unless it is there already or was elsewhere since.
         moved = len(memory.chosen) == memory.followed
         chosen = choose_reachable(

@@ -2,7 +2,8 @@
 
 Every sample of a set is asked as it is (also symmetric objects), with each kind of foreign test
 objects in turn, and with clouds disturbed as in the field. A caller refuses where one of the two
-objects is less familiar than a threshold of its choice.
+objects is less familiar than a threshold of its choice, or the confidence in the answer is below
+another one.
 """
 
 import argparse
@@ -35,7 +36,12 @@ class FamiliarityRow:
     index: int
     kind: str  # OWN, one of FOREIGN_KINDS or one of FIELD_KINDS
     familiarity: float  # of the less familiar object
+    confidence: float  # in the answer; NaN where the aligner tells none
     right: bool  # within 2 cm and 10 degrees, modulo symmetry; never for foreign objects
+
+    def refused(self, familiarity: float, confidence: float) -> bool:
+        """Whether it is below one of two thresholds."""
+        return self.familiarity < familiarity or self.confidence < confidence
 
 
 def measure_familiarity(
@@ -63,19 +69,25 @@ def measure_familiarity(
                     f"aligner {aligner.name}: gives no familiarity: use iga with its landed weights"
                 )
             right = name not in FOREIGN_KINDS and is_right(question, sample, estimate.poses[0])
-            rows.append(FamiliarityRow(index, name, float(estimate.familiarity.min()), right))
+            least = float(estimate.familiarity.min())
+            sure = float("nan") if estimate.confidence is None else estimate.confidence
+            rows.append(FamiliarityRow(index, name, least, sure, right))
     return rows
 
 
-def refused(rows: list[FamiliarityRow], kind: str, threshold: float) -> float:
+def refused(
+    rows: list[FamiliarityRow], kind: str, threshold: float, confidence: float = 0.0
+) -> float:
     """Share of the questions of a kind below a threshold; NaN where there are none."""
-    values = np.array([row.familiarity for row in rows if row.kind == kind])
-    return float((values < threshold).mean()) if len(values) else float("nan")
+    values = [row.refused(threshold, confidence) for row in rows if row.kind == kind]
+    return float(np.mean(values)) if values else float("nan")
 
 
-def right_or_refused(rows: list[FamiliarityRow], kind: str, threshold: float) -> float:
+def right_or_refused(
+    rows: list[FamiliarityRow], kind: str, threshold: float, confidence: float = 0.0
+) -> float:
     """Share of the questions of a kind answered right or below a threshold."""
-    values = [row.right or row.familiarity < threshold for row in rows if row.kind == kind]
+    values = [row.right or row.refused(threshold, confidence) for row in rows if row.kind == kind]
     return float(np.mean(values)) if values else float("nan")
 
 
@@ -88,23 +100,42 @@ def area(rows: list[FamiliarityRow]) -> float:
     return float(((difference > 0) + 0.5 * (difference == 0)).mean())
 
 
-def familiarity_table(split: str, rows: list[FamiliarityRow], threshold: float) -> str:
+def confidence_table(rows: list[FamiliarityRow], bins: int = 5) -> str:
+    """How often answers of a confidence are right, about objects that the demonstrations show, as
+    text; empty where the aligner tells no confidence."""
+    known = [row for row in rows if row.kind not in FOREIGN_KINDS and row.confidence >= 0]
+    if not known:
+        return ""
+    lines = ["confidence     count  mean, %  right, %"]
+    for k in range(bins):
+        low, high = k / bins, (k + 1) / bins
+        of = [r for r in known if low <= r.confidence and (r.confidence < high or k == bins - 1)]
+        if of:
+            mean = 100 * float(np.mean([row.confidence for row in of]))
+            right = 100 * float(np.mean([row.right for row in of]))
+            lines.append(f"{low:.1f} to {high:.1f}     {len(of):5d} {mean:8.1f} {right:9.1f}")
+    return "\n".join(lines)
+
+
+def familiarity_table(
+    split: str, rows: list[FamiliarityRow], threshold: float, confidence: float = 0.0
+) -> str:
     """What is refused, and what is answered wrong, of every kind of question, as text."""
     lines = [
         f"{split}: own objects look more familiar than foreign ones in {100 * area(rows):.1f} % of "
-        f"the comparisons; refused below {threshold:g}:",
+        f"the comparisons; refused below {threshold:g} or a confidence of {confidence:g}:",
         "question       count  refused, %  right, %  right or refused, %",
     ]
     for kind in dict.fromkeys(row.kind for row in rows):
         of = [row for row in rows if row.kind == kind]
-        line = f"{kind:<14} {len(of):5d} {100 * refused(rows, kind, threshold):11.1f}"
+        line = f"{kind:<14} {len(of):5d} {100 * refused(rows, kind, threshold, confidence):11.1f}"
         if kind not in FOREIGN_KINDS:
             line += (
                 f" {100 * float(np.mean([row.right for row in of])):9.1f}"
-                f" {100 * right_or_refused(rows, kind, threshold):20.1f}"
+                f" {100 * right_or_refused(rows, kind, threshold, confidence):20.1f}"
             )
         lines.append(line)
-    return "\n".join(lines)
+    return "\n".join((*lines, confidence_table(rows)))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -121,7 +152,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--threshold", type=float, default=0.5, help="least familiarity (default 0.5)"
     )
-    parser.add_argument("--json", action="store_true", help="every familiarity")
+    parser.add_argument(
+        "--confidence", type=float, default=0.1, help="least confidence (default 0.1)"
+    )
+    parser.add_argument("--json", action="store_true", help="every familiarity and confidence")
 
 
 def run(arguments: argparse.Namespace, aligner: Aligner | None = None) -> int:
@@ -136,8 +170,9 @@ def run(arguments: argparse.Namespace, aligner: Aligner | None = None) -> int:
             raise IgaDrakeError(f"--fields: '{field}' is not known; one of: {known}")
     if arguments.count < 1:
         raise IgaDrakeError(f"--count {arguments.count}: at least 1 is needed")
-    if not 0 <= arguments.threshold <= 1:
-        raise IgaDrakeError(f"--threshold {arguments.threshold:g}: expected 0 to 1")
+    for name in ("threshold", "confidence"):
+        if not 0 <= (value := getattr(arguments, name)) <= 1:
+            raise IgaDrakeError(f"--{name} {value:g}: expected 0 to 1")
     aligner = aligner or IgaAligner()
     document = []
     for name in names:
@@ -147,7 +182,8 @@ def run(arguments: argparse.Namespace, aligner: Aligner | None = None) -> int:
                 {"set": name, "area": area(rows), "questions": [asdict(row) for row in rows]}
             )
         else:
-            print(familiarity_table(name, rows, arguments.threshold) + "\n", flush=True)
+            table = familiarity_table(name, rows, arguments.threshold, arguments.confidence)
+            print(table + "\n", flush=True)
     if arguments.json:
         print(json.dumps(document, indent=2))
     return 0

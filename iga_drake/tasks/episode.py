@@ -92,6 +92,7 @@ class WaypointResult:
             "name": self.name,
             "energy": self.energy,
             "familiarity": None if known is None else known.tolist(),
+            "confidence": self.estimate.confidence,
             "position_error": self.position_error,
             "rotation_error": self.rotation_error,
             "inference_seconds": self.inference_seconds,
@@ -342,7 +343,7 @@ class Episode:
             self._build_seconds = wall.perf_counter() - began
             self._begin()
         except BaseException:
-            self.close()
+            self._end_beside()
             raise
 
     def _make_inference(self, aligner: str | Aligner) -> Inference:
@@ -377,10 +378,14 @@ class Episode:
         """Ends the aligner's process and the log, and lets go of the diagram's state, some hundred
         MB that Drake keeps otherwise for as long as Python runs: Python's systems are never
         collected. What was seen before (`snapshots`, a result) stays."""
+        self._end_beside()
+        self.simulator.reset_context(None)
+
+    def _end_beside(self) -> None:
+        """Ends what goes on beside the diagram: the aligner's process and the log."""
         self.inference.close()
         if self.log is not None:
             self.log.close()
-        self.simulator.reset_context(None)
 
     def __enter__(self) -> "Episode":
         return self

@@ -47,7 +47,7 @@ class Visualization:
 
 
 # Where one looks from and at (m, in W), and how wide (degrees, from top to bottom).
-_CAMERA, _CAMERA_TARGET, _CAMERA_FIELD = [1.75, -0.95, 0.95], [0.22, 0.0, 0.33], 40.0
+VIEW_EYE, VIEW_TARGET, VIEW_FIELD = [1.75, -0.95, 0.95], [0.22, 0.0, 0.33], 40.0
 _NEWTONS_PER_METER, _LEAST_FORCE = 200.0, 0.5  # N/m, N
 _CONTACT_PERIOD = 0.1  # s at least: one contact is many numbers in a recording
 _POLL = 0.02  # s between two looks at the buttons or at the connections
@@ -64,8 +64,8 @@ def start_meshcat(config: Visualization | None = None) -> Meshcat:
             f"visualization.port: {config.port} can't be used ({error_text(error)}): name another, "
             "or null for the first free one"
         ) from error
-    meshcat.SetCamera(Meshcat.PerspectiveCamera(fov=_CAMERA_FIELD, near=0.01, far=50.0))
-    meshcat.SetCameraPose(np.array(_CAMERA), np.array(_CAMERA_TARGET))
+    meshcat.SetCamera(Meshcat.PerspectiveCamera(fov=VIEW_FIELD, near=0.01, far=50.0))
+    meshcat.SetCameraPose(np.array(VIEW_EYE), np.array(VIEW_TARGET))
     for path in ("/Grid", "/Axes"):
         meshcat.SetProperty(path, "visible", False)
     meshcat.SetProperty("/Background", "top_color", [0.97, 0.98, 1.0])

@@ -88,13 +88,15 @@ def end_recording(meshcat: Meshcat) -> None:
     meshcat.PublishRecording()
 
 
-def replay_html(meshcat: Meshcat, episode: Mapping[str, Any]) -> str:
+def replay_html(meshcat: Meshcat, episode: Mapping[str, Any], poster: bytes | None = None) -> str:
     """A page that needs no server: the recording of an episode, with its verdict and errors, a
     legend, and a time line of its phases to move along.
 
     Args:
       meshcat: holds the published recording.
       episode: plain JSON values, as `EpisodeResult.row` gives them.
+      poster: a JPEG that is seen until the browser has drawn the recording, as
+        `replay_poster` renders it.
     """
     meshcat.Flush()
     page = meshcat.StaticHtml()
@@ -102,31 +104,47 @@ def replay_html(meshcat: Meshcat, episode: Mapping[str, Any]) -> str:
     overlay = importlib.resources.files(__package__).joinpath("timeline.html").read_text("utf-8")
     head, body, rest = page.rpartition("</body>")
     data = f'<script type="application/json" id="episode">{data}</script>'
-    return packed_page("\n".join((head, data, overlay, body + rest)))
+    return packed_page("\n".join((head, data, overlay, body + rest)), poster)
 
 
-def packed_page(page: str) -> str:
-    """A page that unpacks itself into `page` when it is opened, of about half its size."""
+def packed_page(page: str, poster: bytes | None = None) -> str:
+    """A page that unpacks itself into `page` when it is opened, of about half its size. Until
+    `page` removes the element "iga-poster", the picture `poster` (JPEG) lies over it, as high as
+    the window."""
     packed = base64.b64encode(gzip.compress(page.encode(), compresslevel=6, mtime=0)).decode()
-    return _UNPACKING.replace("PACKED", packed)
+    shown = ""
+    if poster is not None:
+        shown = _POSTER.replace("JPEG", base64.b64encode(poster).decode())
+    return _UNPACKING.replace("POSTER", shown).replace("PACKED", packed)
+
+
+_POSTER = """<img id="iga-poster" alt="" src="data:image/jpeg;base64,JPEG" style="position: fixed;
+  z-index: 4; top: 0; height: 100vh; left: 50%; transform: translateX(-50%)">
+"""
 
 
 _UNPACKING = """<!doctype html>
-<html><head><meta charset="utf-8"></head><body>
-<script type="text/plain" id="packed">PACKED</script>
+<html><head><meta charset="utf-8"></head><body style="margin: 0">
+POSTER<script type="text/plain" id="packed">PACKED</script>
 <script>
 (async () => {
   if (typeof DecompressionStream === "undefined") {
     document.body.textContent = "This page needs a browser of 2023 or newer.";
     return;
   }
-  const packed = atob(document.getElementById("packed").textContent);
-  const bytes = Uint8Array.from(packed, (letter) => letter.charCodeAt(0));
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-  const page = await new Response(stream).text();
+  const packed = document.getElementById("packed").textContent;
+  const bytes = (await fetch("data:application/gzip;base64," + packed)).body;
+  const page = await new Response(bytes.pipeThrough(new DecompressionStream("gzip"))).text();
+  const poster = document.getElementById("iga-poster");
+  if (poster) {  // is on the screen before the work begins; a hidden page draws no frames
+    await poster.decode();
+    const frame = () => new Promise(requestAnimationFrame);
+    await Promise.race([frame().then(frame), new Promise((done) => setTimeout(done, 500))]);
+  }
   document.open();
   document.write(page);
   document.close();
+  if (poster) document.body.append(poster);
 })();
 </script></body></html>
 """

@@ -130,10 +130,10 @@ ANYTHING = st.one_of(
 )
 
 
-@given(ANYTHING, ANYTHING, ANYTHING, ANYTHING)
-def test_an_estimate_is_one_or_is_refused(poses, energies, probabilities, familiarity) -> None:
+@given(ANYTHING, ANYTHING, ANYTHING, ANYTHING, st.one_of(ANYTHING, st.none(), st.floats()))
+def test_an_estimate_is_one_or_is_refused(poses, energies, probabilities, known, sure) -> None:
     try:
-        found = PoseEstimate(poses, energies, probabilities, familiarity)
+        found = PoseEstimate(poses, energies, probabilities, known, sure)
     except AlignerError as error:
         assert str(error).startswith("PoseEstimate.")
         return
@@ -146,6 +146,7 @@ def test_an_estimate_is_one_or_is_refused(poses, energies, probabilities, famili
     assert np.isfinite(found.energies).all() and (found.probabilities >= 0).all()
     known = found.familiarity
     assert known is None or (known.shape == (2,) and ((known >= 0) & (known <= 1)).all())
+    assert found.confidence is None or 0 <= found.confidence <= 1
 
 
 @given(ANYTHING)

@@ -56,6 +56,7 @@ class FakeAligner:
     poses: tuple[RigidTransform, ...] = (X_GOAL,)
     error: BaseException | None = None
     familiarity: tuple[float, float] | None = None
+    confidence: float | None = None
     calls: list = field(default_factory=list)
     ups: list = field(default_factory=list)
 
@@ -67,8 +68,9 @@ class FakeAligner:
         matrices = np.stack([X.GetAsMatrix4() for X in self.poses])
         count = len(matrices)
         return PoseEstimate(
-            matrices, np.arange(count, dtype=float), np.full(count, 1 / count), self.familiarity
-        )
+            matrices, np.arange(count, dtype=float), np.full(count, 1 / count), self.familiarity,
+            self.confidence,
+        )  # fmt: skip
 
 
 @dataclass

@@ -303,6 +303,17 @@ def test_objects_that_look_like_none_of_the_demonstrations_are_refused_where_ask
             assert "(familiarity 0.20); at least 0.5 is asked for" in memory.status.reason
 
 
+def test_answers_that_are_hardly_right_are_refused_where_asked():
+    for confidence, least, refused in ((0.05, 0.1, True), (0.1, 0.1, False), (0.0, 0.0, False),
+                                       (0.6, 0.7, True), (None, 0.9, False)):  # fmt: skip
+        machine = make_machine(aligner=FakeAligner(confidence=confidence), minimum_confidence=least)
+        memory, targets = run(machine, FakeInputs())
+        assert (memory.status.phase == Phase.REFUSED) == refused
+        if refused:
+            assert memory.status.cause == "alignment" and list(targets) == [0]
+            assert f"with a probability of {confidence:.2f} alone" in memory.status.reason
+
+
 def test_unreachable_poses_are_refused():
     memory, targets = run(make_machine(solve=lambda X_WE, near: None), FakeInputs())
     assert (memory.status.phase, memory.status.cause) == (Phase.REFUSED, "IK")

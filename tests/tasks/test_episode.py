@@ -14,6 +14,7 @@ from iga_drake.aligners.protocol import AlignerError, PoseEstimate
 from iga_drake.demonstrations.demonstration import DemonstrationError
 from iga_drake.demonstrations.plausibility import check_plausible
 from iga_drake.demonstrations.store import write_demonstrations
+from iga_drake.errors import ConfigError
 from iga_drake.policy.motion import Phase
 from iga_drake.station.cameras.rgbd import LookAt
 from iga_drake.station.scenario import Scenario, load_scenario
@@ -131,6 +132,12 @@ def test_demonstrations_of_another_task_are_refused_before_anything_is_built(
 def test_unknown_aligners_and_options_are_refused(scenario: Scenario):
     with pytest.raises(AlignerError, match=r"one of: .*icp, iga"):
         Episode(scenario, aligner="orakel")
+
+
+def test_a_scenario_changed_in_python_is_refused_for_its_own_reason(scenario: Scenario):
+    scenario.control.linear_speed = 5.0  # what a file would not be read with
+    with pytest.raises(ConfigError, match=r"linear_speed.* 5"):
+        Episode(scenario, aligner="expert")
 
 
 def test_no_demonstrations_are_refused(scenario: Scenario):

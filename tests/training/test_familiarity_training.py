@@ -9,8 +9,10 @@ import torch
 from iga_drake.aligners.iga.aligner import IgaAligner, default_weights
 from iga_drake.aligners.iga.familiarity import FIGURES, FamiliarityNet
 from iga_drake.training.familiarity import (
+    Answer,
     Example,
     FamiliarityTraining,
+    fit_confidence,
     fit_familiarity,
     refused_shares,
     train_familiarity,
@@ -49,7 +51,29 @@ def test_an_object_that_nothing_is_known_of_counts_for_nothing() -> None:
         torch.testing.assert_close(a, b, rtol=0.05, atol=0.05)
 
 
+def test_the_confidence_is_the_probability_of_a_right_answer() -> None:
+    """Answers whose log odds of being right are 1 - energy / demonstrations."""
+    rng = np.random.default_rng(0)
+    answers = []
+    for k in range(6000):
+        demonstrations = 1 + k % 4
+        energy = demonstrations * rng.normal()
+        right = rng.random() < 1 / (1 + np.exp(energy / demonstrations - 1))
+        figures = rng.normal(size=(2, len(FIGURES)))
+        answers.append(Answer(energy, demonstrations, figures, bool(right)))
+    net = FamiliarityNet()
+    net.weight.data[0] = 1.0  # familiarities differ and tell nothing
+    fit_confidence(net, answers)
+    net = net.double()
+    for energy, demonstrations in ((0.0, 3), (2.0, 2), (-1.0, 1)):
+        x = net.answer_figures(torch.tensor(energy), demonstrations, torch.zeros(2, len(FIGURES)))
+        expected = 1 / (1 + np.exp(energy / demonstrations - 1))
+        assert float(net.confidence(x)) == pytest.approx(expected, abs=0.03)
+
+
 def test_what_cannot_be_fitted_is_refused() -> None:
+    with pytest.raises(TrainingError, match="all answers are right"):
+        fit_confidence(FamiliarityNet(), [Answer(0.0, 1, np.zeros((2, len(FIGURES))), True)] * 9)
     with pytest.raises(TrainingError, match="take more samples"):
         fit_familiarity([e for e in _examples(20) if e.kind == "own"], 0.02)
     with pytest.raises(TrainingError, match="samples = 1"):
@@ -58,7 +82,11 @@ def test_what_cannot_be_fitted_is_refused() -> None:
 
 def test_it_is_written_with_what_it_was_fitted_to(tmp_path: Path) -> None:
     card = train_familiarity(tmp_path, config=FamiliarityTraining(samples=8))
-    assert card["examples"] == 24 and {"own", "swapped", "ring"} <= set(card["refused"])
+    assert (
+        card["examples"] == 24
+        and card["answers"] == 32
+        and {"own", "swapped", "ring"} <= set(card["refused"])
+    )
     path = tmp_path / "familiarity.safetensors"
     aligner = IgaAligner(weights=default_weights(), familiarity=path)
     assert isinstance(aligner, IgaAligner)

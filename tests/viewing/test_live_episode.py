@@ -7,11 +7,12 @@ import os
 from pathlib import Path
 
 import numpy as np
-from browser import ROBOT, Browser, is_drawn, needs_browser, open_replay
+from browser import ROBOT, Browser, first_paint, is_drawn, needs_browser, open_replay
 from PIL import Image
 
 from iga_drake import Episode, load_scenario
 from iga_drake.policy.motion import Phase
+from iga_drake.tasks.frames import replay_poster
 from iga_drake.viewing.meshcat import start_meshcat
 from iga_drake.viewing.replay import begin_recording, end_recording, replay_html
 
@@ -33,6 +34,7 @@ def test_an_episode_is_looked_at_live_and_as_a_replay(tmp_path: Path):
     meshcat = start_meshcat(scenario.visualization)
     begin_recording(meshcat, live=True)
     with Episode(scenario, seed=3, meshcat=meshcat) as episode:
+        poster = replay_poster(episode)
         status = episode.step(MOMENT)
         assert status.phase is Phase.MOVE, status.reason
         with Browser(tmp_path / "live", width=1280, height=720) as browser:
@@ -49,11 +51,17 @@ def test_an_episode_is_looked_at_live_and_as_a_replay(tmp_path: Path):
         row = result.row()
         end_recording(meshcat)
     page = tmp_path / "stack.html"
-    page.write_text(replay_html(meshcat, row), encoding="utf-8")
+    page.write_text(replay_html(meshcat, row, poster), encoding="utf-8")
+    (tmp_path / "poster.jpg").write_bytes(poster)
+    assert has_table(tmp_path / "poster.jpg")
     assert result.success and page.stat().st_size <= 4e6
     with Browser(tmp_path / "replay", width=1280, height=720) as browser:
         open_replay(browser, page, tmp_path / "first.png", at=MOMENT)
         assert has_table(tmp_path / "first.png")
+        # The still picture was on the screen before the recording was, and is gone now.
+        begins = browser.evaluate("performance.getEntriesByName('iga-begins')[0].startTime / 1000")
+        assert first_paint(browser) < begins
+        browser.wait_for("document.getElementById('iga-poster') === null")
         assert "SUCCESS" in browser.evaluate("document.body.innerText")
         browser.picture(pictures / "replay.jpg", **JPEG)
         assert browser.errors == []

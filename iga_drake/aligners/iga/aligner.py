@@ -87,6 +87,7 @@ class Explanation:
     # From a pose X_WF (4, 4): (P, Q) shares of the pairs of parts, the first nodes of each.
     pair_weights: Callable[[Tensor], Tensor]
     familiarity_figures: Tensor  # (2, FIGURES) of the grasped and of the target object
+    answer_figures: Tensor  # (ANSWER_FIGURES,) of the best pose
     seconds: dict[str, float]  # of each stage
 
     @cached_property
@@ -161,7 +162,8 @@ class IgaAligner:
         Args:
           energy: network or checkpoint; read and used with the ranking "energy" alone.
           familiarity: network or checkpoint, fitted to these descriptors; None: estimates have no
-            familiarity. Default: the landed one with the landed descriptors, none with others.
+            familiarity and no confidence. Default: the landed one with the landed descriptors,
+            none with others.
 
         The networks themselves are left as they are. Raises `CheckpointError` (`checkpoint`) for a
         missing or foreign file, or a familiarity fitted to other descriptors.
@@ -318,9 +320,13 @@ class IgaAligner:
             energy, pair_weights = prepared, prepared.pair_weights
         stage()
         figures = self._familiarity_figures(test, shown, M)
-        familiarity = None
-        if self._familiarity is not None:
-            familiarity = self._familiarity(figures).numpy()
+        net = self._familiarity
+        answer = (net or FamiliarityNet().double()).answer_figures(energies[0], D, figures)
+        familiarity, confidence = None, None
+        if net is not None:
+            familiarity = net(figures).numpy()
+            if self._energy is None:  # the learned energy has another scale
+                confidence = float(net.confidence(answer))
         stage()
         probability = (-(energies - energies.min())).softmax(0).numpy()
         keep = probability >= self.config.minimum_probability * probability.max()
@@ -346,6 +352,7 @@ class IgaAligner:
                 energies.numpy()[keep],
                 probability[keep] / probability[keep].sum(),
                 familiarity,
+                confidence,
             ),
             nodes=torch.cat(
                 (
@@ -363,6 +370,7 @@ class IgaAligner:
             energy=lambda X: energy(in_own_frames(X)),
             pair_weights=lambda X: pair_weights(in_own_frames(X)),
             familiarity_figures=figures,
+            answer_figures=answer,
             seconds=dict(zip(INFERENCE_STAGES, np.diff(times).tolist(), strict=True)),
         )
 

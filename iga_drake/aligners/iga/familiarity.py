@@ -1,10 +1,14 @@
-"""Familiarity: how sure it is that the demonstrations show objects like a test object.
+"""Familiarity: how sure it is that the demonstrations show objects like a test object; and the
+confidence in an answer.
 
-It is computed from descriptors and sizes.
+Familiarity is computed from descriptors and sizes.
 
 A test object is familiar when its nodes match the demonstrations' nodes as well as these match each
 other. The comparison makes symmetric objects, whose matches are ambiguous by nature, as familiar as
 others. Both objects of a pair are judged on their own.
+
+The confidence is the probability that the answer is right, from how well the demonstrations agree
+about it (the vote's energy) and how familiar both objects are.
 """
 
 from typing import NamedTuple
@@ -23,6 +27,12 @@ FIGURES = (
     "ratio of the widths, longest direction",
 )  # the first five less the same among the demonstrations; ratios as magnitudes of logarithms
 MATCHES = 5  # of the figures are compared with those among the demonstrations
+ANSWER_FIGURES = (
+    "energy for each demonstration",
+    "one over the number of demonstrations",
+    "familiarity of the grasped object, log odds",
+    "familiarity of the target, log odds",
+)  # the vote's energy grows with the number of demonstrations, but for a constant
 
 
 class ObjectNodes(NamedTuple):
@@ -42,13 +52,28 @@ class FamiliarityNet(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.zeros(len(FIGURES)))
         self.bias = nn.Parameter(torch.zeros(()))
+        self.answer_weight = nn.Parameter(torch.zeros(len(ANSWER_FIGURES)))
+        self.answer_bias = nn.Parameter(torch.zeros(()))
         # What the demonstrations' matches among each other come to, as a rule. Demonstrations of
         # the very same object, or a single one, are taken to be this much alike.
         self.register_buffer("typical", torch.zeros(MATCHES))
 
     def forward(self, figures: Tensor) -> Tensor:
         """(...) familiarities in [0, 1] from figures (..., FIGURES) of objects."""
-        return torch.sigmoid(figures.to(self.weight.dtype) @ self.weight + self.bias)
+        return torch.sigmoid(self._odds(figures))
+
+    def _odds(self, figures: Tensor) -> Tensor:
+        return figures.to(self.weight.dtype) @ self.weight + self.bias
+
+    def answer_figures(self, energy: Tensor, demonstrations: int, figures: Tensor) -> Tensor:
+        """(ANSWER_FIGURES,) of an answer: the energy of its best pose, the number of
+        demonstrations, and figures (2, FIGURES) of the grasped and of the target object."""
+        share = 1 / torch.tensor(demonstrations, dtype=self.weight.dtype)
+        return torch.cat((torch.stack((share * energy, share)), self._odds(figures)))
+
+    def confidence(self, figures: Tensor) -> Tensor:
+        """(...) probabilities that answers are right, from figures (..., ANSWER_FIGURES)."""
+        return torch.sigmoid(figures @ self.answer_weight + self.answer_bias)
 
 
 def _matches(similarity: Tensor, temperature: float) -> Tensor:

@@ -60,8 +60,8 @@ def raw_message(pixels: np.ndarray, kind: str, camera: str) -> Any:
 
 def read_raw(message: Any, kind: str) -> np.ndarray:
     """(H, W, 1) float32 or int16 of `raw_message`."""
-    pixels = np.frombuffer(message.data, dtype=_RAW[kind][1])
-    pixels = pixels.reshape(message.height, message.width, 1)
+    flat: np.ndarray = np.frombuffer(message.data, dtype=_RAW[kind][1])
+    pixels = flat.reshape(message.height, message.width, 1)
     return pixels.view("<i2") if kind == "label" else pixels
 
 
@@ -180,6 +180,7 @@ def estimate_values(name: str, estimate: PoseEstimate) -> dict[str, Any]:
         "energies": estimate.energies,
         "probabilities": estimate.probabilities,
         "familiarity": estimate.familiarity,
+        "confidence": estimate.confidence,
     }
 
 
@@ -191,6 +192,7 @@ def read_estimate(values: Mapping[str, Any]) -> PoseEstimate:
         energies=np.array(values["energies"]),
         probabilities=np.array(values["probabilities"]),
         familiarity=None if known is None else np.array(known),
+        confidence=values.get("confidence"),
     )
 
 

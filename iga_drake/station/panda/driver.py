@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-from pydrake.lcm import DrakeLcm
+from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort
 from pydrake.systems.lcm import LcmBuses
@@ -78,7 +78,7 @@ def ApplyDriverConfig(
     driver_config.check()
     model = find_panda(sim_plant, sim_plant.GetModelInstanceByName(model_instance_name))
     ports = add_panda_ports(builder, model, Panda())
-    lcm = lcms.Find(f"driver of {model_instance_name}", driver_config.lcm_bus)
+    lcm = _find_bus(builder, lcms, driver_config.lcm_bus, model_instance_name)
     if lcm.get_lcm_url() == LcmBuses.kLcmUrlMemqNull:
         return
     if lcm.get_lcm_url().startswith("memq://"):
@@ -93,6 +93,18 @@ def ApplyDriverConfig(
     )
     add_panda_server(builder, server, lcm)
     connect_server(builder, server, ports)
+
+
+def _find_bus(
+    builder: DiagramBuilder, lcms: LcmBuses, bus: str, model_instance_name: str
+) -> DrakeLcmInterface:
+    """The bus by its name. With Drake 1.58, what `LcmBuses.Find` returns for a bus that is a system
+    of the diagram ends the process at its first use, so the system itself is looked for first."""
+    lcm = lcms.Find(f"driver of {model_instance_name}", bus)
+    system = f"LcmInterfaceSystem(bus_name={bus})"
+    if builder.HasSubsystemNamed(system):
+        return cast(DrakeLcmInterface, builder.GetSubsystemByName(system))
+    return lcm
 
 
 def connect_server(

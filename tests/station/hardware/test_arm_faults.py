@@ -267,6 +267,44 @@ def test_a_fault_while_the_arm_moves(moving: Robot, name: str):
     check_held(moving, cause, reason)
 
 
+def doubled() -> Callable:
+    return lambda _, data: [data, data]
+
+
+def out_of_order() -> Callable:
+    """Each second message arrives behind the one after it."""
+    kept: list[bytes] = []
+
+    def pass_on(_: Context, data: bytes) -> list[bytes]:
+        if not kept:
+            kept.append(data)
+            return []
+        return [data, kept.pop()]
+
+    return pass_on
+
+
+def thinned() -> Callable:
+    """Two of three messages are lost."""
+    count = 0
+
+    def pass_on(_: Context, data: bytes) -> list[bytes]:
+        nonlocal count
+        count += 1
+        return [data] if count % 3 == 0 else []
+
+    return pass_on
+
+
+@pytest.mark.parametrize("make", [doubled, out_of_order, thinned])
+def test_a_link_that_is_good_enough_stops_nothing(moving: Robot, make: Callable):
+    begins = moving.joints
+    moving.server.link = make()
+    moving.advance(0.2)
+    assert moving.status.phase is Phase.MOVE and not moving.holding, moving.status.reason
+    assert np.abs(moving.joints - begins).max() > 0.01
+
+
 @pytest.mark.parametrize("pause", [0.15, 0.5])
 def test_an_arm_that_recovers_does_not_go_on(moving: Robot, pause: float):
     """However long it takes, and wherever the trajectory would be meanwhile."""
