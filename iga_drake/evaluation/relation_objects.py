@@ -138,7 +138,7 @@ class RelationObjects:
         for _ in range(_TRIES):
             A = self._one(relation.grasped, split, rng)
             B = self._one(relation.target, split, rng)
-            X_BA = true_pose(relation, A, B)
+            X_BA = placed_pose(relation, A, B)
             if X_BA is not None:
                 return PlacedPair(A, B, X_BA)
         raise RelationObjectError(
@@ -171,7 +171,7 @@ def _read(entry: MeshEntry, unit: float, extent: float) -> ShapeInstance:
     return read_mesh_object(entry.path, MeshReading(unit=unit, up=up))
 
 
-def true_pose(
+def placed_pose(
     relation: PlacingRelation, grasped: ShapeInstance, target: ShapeInstance
 ) -> np.ndarray | None:
     """X_BA (4, 4) where A belongs on B, None where these two don't fit each other."""

@@ -18,7 +18,7 @@ from iga_drake.evaluation.relation_objects import (
     handle_hole,
     lowered,
     lowered_floor,
-    true_pose,
+    placed_pose,
 )
 from iga_drake.evaluation.relations import (
     MOST_TILT,
@@ -107,7 +107,7 @@ def test_things_are_let_down_as_far_as_they_go() -> None:
     assert lowered(wide, _tray()) == pytest.approx(0.06 + 0.04, abs=1e-3)
     assert lowered_floor(_tray()) == pytest.approx(0.01, abs=1e-3)
     relation = placing_relation("bottle_in_container")
-    assert true_pose(relation, wide, _tray()) is None
+    assert placed_pose(relation, wide, _tray()) is None
 
 
 def test_the_hole_of_a_handle_is_found_whichever_way_it_points() -> None:
