@@ -1,17 +1,25 @@
 """The ICP baseline: registers a demonstration's objects with the test objects, rigidly.
 
-Per demonstration the grasped and the target cloud are registered with the test's (Open3D,
-multi-start, point-to-plane); with `X_A`, `X_B` from demonstration to test the answer is
-`X_B X_A^-1`. The best demonstration is the one with the smallest mean distance of both
+Per demonstration the grasped and the target cloud are registered with the test's; with `X_A`, `X_B`
+from demonstration to test the answer is `X_B X_A^-1`. Many starts descend together on few points
+(point-to-point), the worse ones are given up on the way, and the best are finished on all points
+(Open3D, point-to-plane). The best demonstration is the one with the smallest mean distance of both
 registrations. Where an object's way up is known, its registrations start from turns about it.
 """
 
+from typing import Any
+
 import numpy as np
+from scipy.spatial import cKDTree
 
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate, check_question
 from iga_drake.demonstrations.alignment import Alignment, check_direction
+from iga_drake.geometry.rigid_fit import rigid_fit
 
 _MOST_STARTS = 1000
+_COARSE_POINTS = 64  # of a cloud, on which the starts descend
+# Iterations of the starts, and the share of them that goes on after each.
+_COARSE = ((3, 0.25), (8, 1.0))
 _Ups = tuple[np.ndarray, np.ndarray]  # ways up (3,) of a source and of a goal
 
 
@@ -49,13 +57,38 @@ def _ups(
     return list(known) if len(known) == len(demonstrated) else [None] * len(demonstrated)
 
 
+def _descended(
+    source: np.ndarray, goal: np.ndarray, R: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Point-to-point ICP of a cloud (n, 3) to another (m, 3) from rotations (S, 3, 3) about the
+    centres, all together.
+
+    Returns rotations and shifts of those that were not given up, and their symmetric mean distances
+    (m), the best first.
+    """
+    onto, back = cKDTree(goal), cKDTree(source)
+    p = goal.mean(0) - R @ source.mean(0)
+
+    def moved() -> np.ndarray:
+        return source @ np.swapaxes(R, 1, 2) + p[:, None]
+
+    for iterations, share in _COARSE:
+        for _ in range(iterations):
+            R, p = rigid_fit(source, goal[onto.query(moved())[1]])
+        there = onto.query(moved())[0].mean(1)
+        distance = 0.5 * (there + back.query((goal - p[:, None]) @ R)[0].mean(1))
+        order = np.argsort(distance)[: max(1, round(share * len(R)))]
+        R, p, distance = R[order], p[order], distance[order]
+    return R, p, distance
+
+
 class IcpAligner:
-    """`Aligner` by multi-start ICP. `starts` rotations, `refined` of them finished
+    """`Aligner` by multi-start ICP. `starts` rotations, of which `refined` are finished
     point-to-plane."""
 
     name = "icp"
 
-    def __init__(self, *, starts: int = 24, refined: int = 3, voxel: float = 0.01):
+    def __init__(self, *, starts: int = 96, refined: int = 3, voxel: float = 0.01):
         for name, value in (("starts", starts), ("refined", refined)):
             if not (float(value).is_integer() and 1 <= value <= _MOST_STARTS):
                 raise AlignerError(f"icp: {name} {value}, an integer from 1 to 1000 expected")
@@ -72,21 +105,16 @@ class IcpAligner:
         """Motion (4, 4) of the source cloud onto the goal and the symmetric mean distance (m)."""
         o3d = _open3d()
         reg = o3d.pipelines.registration
-        coarse_s, coarse_g = (c.voxel_down_sample(self.voxel) for c in (source, goal))
-        centre_s, centre_g = (np.asarray(c.points).mean(0) for c in (source, goal))
-        trials = []
-        for R in _starts(self.starts, rng, ups):
-            X = np.eye(4)
-            X[:3, :3] = R
-            X[:3, 3] = centre_g - R @ centre_s
-            result = reg.registration_icp(
-                coarse_s, coarse_g, 0.1, X, reg.TransformationEstimationPointToPoint(),
-                reg.ICPConvergenceCriteria(max_iteration=15),
-            )  # fmt: skip
-            trials.append((-result.fitness, result.inlier_rmse, result.transformation))
-        trials.sort(key=lambda trial: trial[:2])
+
+        def few(cloud: Any) -> np.ndarray:
+            points = np.asarray(cloud.voxel_down_sample(self.voxel).points)
+            return points[rng.permutation(len(points))[:_COARSE_POINTS]]
+
+        R, p, _ = _descended(few(source), few(goal), _starts(self.starts, rng, ups))
         best: tuple[float, np.ndarray] | None = None
-        for *_, X in trials[: self.refined]:
+        for k in range(min(self.refined, len(R))):
+            X = np.eye(4)
+            X[:3, :3], X[:3, 3] = R[k], p[k]
             result = reg.registration_icp(
                 source, goal, 0.03, X, reg.TransformationEstimationPointToPlane(),
                 reg.ICPConvergenceCriteria(max_iteration=40),

@@ -71,7 +71,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--weights", help="short for --option weights=FILE")
     parser.add_argument("--energy", help="short for --option energy=FILE")
     card = partial(output_file, begins=(b"#",))
-    parser.add_argument("--card", type=card, help="write a model card of iga's weights")
+    parser.add_argument(
+        "--card", type=card, help="write a model card of iga's weights, or of a single peer's"
+    )
     parser.add_argument("--energy-card", type=card, help="write one of its energy")
     parser.add_argument("--json", action="store_true", help="print the errors as JSON")
 
@@ -162,12 +164,17 @@ def _write_cards(arguments: argparse.Namespace, summaries: list) -> None:
     if not arguments.card and not arguments.energy_card:
         return
     from iga_drake.aligners.iga.aligner import default_energy, default_weights
-    from iga_drake.aligners.iga.weights import ENERGY
+    from iga_drake.aligners.iga.weights import DESCRIPTOR, ENERGY
+    from iga_drake.aligners.peers import ALIGNERS as PEERS
+    from iga_drake.aligners.peers.networks import landed_weights
     from iga_drake.evaluation.alignment import model_card
 
     if arguments.card:
-        weights = Path(arguments.weights or default_weights())
-        write_text(arguments.card, model_card(weights, summaries))
+        name = arguments.aligner[0]
+        peer = len(arguments.aligner) == 1 and name in PEERS
+        landed, kind = (landed_weights(name), name) if peer else (default_weights(), DESCRIPTOR)
+        weights = Path(arguments.weights or landed)
+        write_text(arguments.card, model_card(weights, summaries, kind=kind))
     if arguments.energy_card:
         energy = Path(arguments.energy or default_energy())
         write_text(arguments.energy_card, model_card(energy, summaries, kind=ENERGY))

@@ -9,14 +9,20 @@ from pathlib import Path
 
 import torch
 
-from iga_drake.cli import train_dif_net, train_encoder, train_familiarity, train_paper
+from iga_drake.cli import (
+    train_dif_net,
+    train_encoder,
+    train_familiarity,
+    train_paper,
+    train_peers,
+)
 from iga_drake.errors import kept_on_interrupt
 from iga_drake.files import output_folder
 from iga_drake.training.descriptor import DescriptorSettings, train_descriptor
 from iga_drake.training.energy import EnergySettings, train_energy
 from iga_drake.training.options import add_run_options, run_options, with_options
 from iga_drake.training.ranks import process_group
-from iga_drake.training.run import training_kept
+from iga_drake.training.run import flushed_denormals, training_kept
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     train_encoder.add_arguments(networks.add_parser("encoder", help="local encoder, by occupancy"))
     train_paper.add_arguments(networks.add_parser("paper", help="the paper's networks"))
     train_dif_net.add_arguments(networks.add_parser("dif-net", help="deformed implicit field"))
+    train_peers.add_arguments(networks)
 
 
 def _add_descriptor(parser: argparse.ArgumentParser) -> None:
@@ -85,7 +92,11 @@ def run(arguments: argparse.Namespace) -> int:
 def _train(arguments: argparse.Namespace) -> int:
     if arguments.network == "encoder":
         return train_encoder.run(arguments)
-    torch.set_flush_denormal(True)
+    with flushed_denormals():
+        return _train_flushed(arguments)
+
+
+def _train_flushed(arguments: argparse.Namespace) -> int:
     if arguments.network == "familiarity":
         return train_familiarity.run(arguments)
     if arguments.network == "dif-net":
@@ -94,6 +105,8 @@ def _train(arguments: argparse.Namespace) -> int:
         return train_paper.run(arguments)
     if arguments.network == "energy":
         return _train_energy(arguments)
+    if arguments.network in train_peers.PEERS:
+        return train_peers.run(arguments)
     settings: DescriptorSettings = with_options(DescriptorSettings.of(arguments.out), arguments)
     with process_group(arguments.device) as device:
         card = train_descriptor(

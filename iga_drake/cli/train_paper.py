@@ -53,7 +53,6 @@ def settings_of(arguments: argparse.Namespace) -> PaperSettings:
 def run(arguments: argparse.Namespace) -> int:
     """Runs the training; a run that was stopped (or killed) goes on from its last checkpoint."""
     torch.set_num_threads(arguments.threads)
-    torch.set_flush_denormal(True)
     settings, part = settings_of(arguments), arguments.part
     with process_group(arguments.device) as device:
         card = train_paper(

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from iga_drake.aligners.iga.weights import DESCRIPTOR
+from iga_drake.aligners.iga.weights import DESCRIPTOR, ENERGY
 from iga_drake.aligners.protocol import Aligner
 from iga_drake.aligners.query import sample_query
 from iga_drake.aligners.registry import ORACLE
@@ -357,7 +357,9 @@ def model_card(weights: Path, errors: list[AlignmentErrors], *, kind: str = DESC
     """Markdown: how weights of a kind were trained (from the file itself), and errors with them."""
     _, card = load_checkpoint(weights, kind=kind)
     seed, commit = card["training"]["seed"], card.get("commit") or "unknown"
-    seen = "samples seen" if kind == DESCRIPTOR else "problems seen"
+    seen = "problems seen" if kind == ENERGY else "samples seen"
+    if uses := card["training"].get("uses"):
+        seen += f" (every sample {uses} times)"
     lines = [
         f"# {weights.name}",
         "",

@@ -11,8 +11,10 @@ import json
 import math
 import os
 import subprocess
+import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,18 @@ from iga_drake.training.settings import TrainingError
 
 DECAYS = ("linear", "cosine")
 OPTIMIZERS = ("adamw", "muon")
+
+
+@contextmanager
+def flushed_denormals() -> Iterator[None]:
+    """Numbers too small for full precision count as zero meanwhile, in this thread and those that
+    it starts: processors are slow with them, and small gradients become such."""
+    before = sys.float_info.min / 2 == 0.0
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(before)
 
 
 @dataclass(frozen=True)

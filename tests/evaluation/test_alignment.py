@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from iga_drake import cli
 from iga_drake.aligners.iga.aligner import default_weights
+from iga_drake.aligners.peers.networks import landed_weights
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.checkpoint import load_checkpoint
 from iga_drake.dataset.alignment_error import (
@@ -269,3 +270,16 @@ def test_own_objects_and_our_sets_do_not_go_together(tmp_path: Path, capsys) -> 
         command = ["evaluate", "alignment", "--aligner", "oracle,icp", *map(str, arguments)]
         assert cli.main(command) == cli.BAD_INPUT
         assert message in capsys.readouterr().err
+
+
+def test_the_model_card_of_a_peer_is_of_its_own_weights(tmp_path: Path, capsys) -> None:
+    path = tmp_path / "card.md"
+    options = ["--sets", "validation", "--count", "1", "--card", str(path)]
+    assert cli.main(["evaluate", "alignment", "--aligner", "reldist", *options]) == cli.SUCCESS
+    _, card = load_checkpoint(landed_weights("reldist"), kind="reldist")
+    text = path.read_text("utf-8")
+    assert text.startswith("# reldist.safetensors")
+    assert (
+        f"{card['samples_seen']:,} samples seen (every sample {card['training']['uses']} " in text
+    )
+    assert capsys.readouterr().out.splitlines()[1] in text

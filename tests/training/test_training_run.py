@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from descriptor_runs import assert_same, command, log, state, write_settings
@@ -24,6 +25,7 @@ from iga_drake.training.run import (
     SavedState,
     Term,
     TrainingRun,
+    flushed_denormals,
     learning_rate,
 )
 from iga_drake.training.settings import TrainingError
@@ -72,6 +74,18 @@ def test_a_run_learns_and_logs(tmp_path: Path) -> None:
     assert row["samples_per_second"] > 0 and row["memory_mib"] > 10 and row["workers_mib"] >= 0
     # Of the whole process, that of Python with PyTorch at the least.
     assert 50 < row["memory_mib"] < 1e5
+
+
+def test_denormal_numbers_are_as_before_after_a_training() -> None:
+    small = np.array([sys.float_info.min])
+    assert small[0] / 2 > 0
+    with pytest.raises(KeyError), flushed_denormals():
+        assert small[0] / 2 == 0
+        with flushed_denormals():
+            pass
+        assert small[0] / 2 == 0
+        raise KeyError
+    assert small[0] / 2 > 0
 
 
 def test_the_learning_rate_warms_up_and_decays() -> None:
