@@ -40,6 +40,9 @@ SUBCOMMANDS = {
     "moved-cameras": Subcommand(
         "iga_drake.studies.moved_cameras", "displacements of cameras that the arm's shape shows"
     ),
+    "relations": Subcommand(
+        "iga_drake.cli.evaluate_relations", "R-NDF's three relations, judged by physics"
+    ),
     "scaling": Subcommand(
         "iga_drake.studies.scaling", "time and memory by number of demonstrations",
         "add_evaluate_scaling", "evaluate_scaling",

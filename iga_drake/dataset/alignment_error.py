@@ -5,10 +5,14 @@ centroid of the grasped cloud ends from where it belongs; rotation error: geodes
 demonstrations show several alignments, the nearest one counts.
 """
 
+import re
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from iga_drake.dataset.samples import Sample, SampleConfig
+from iga_drake.errors import IgaDrakeError
 from iga_drake.shapes.symmetry import Symmetry
 
 # Observed clouds of the evaluation sets are denser than those of training, and errors are measured
@@ -33,29 +37,61 @@ def pose_errors(estimate: np.ndarray, truth: np.ndarray, cloud: np.ndarray) -> t
     return float(np.linalg.norm((estimate - truth) @ centre)), float(np.arccos(cosine))
 
 
-def equivalents(sample: Sample, *, symmetry: bool) -> np.ndarray:
+@dataclass(frozen=True)
+class SurfaceTolerance:
+    """How far a turned surface may lie from itself and still count as the same."""
+
+    text: str  # as people write it: "2mm", "1%"
+    value: float  # m, or a share of the object's longest extent
+    relative: bool = False
+
+    @staticmethod
+    def of(text: str) -> "SurfaceTolerance":
+        """The tolerance that a text such as 2mm or 1% names. Raises `IgaDrakeError`."""
+        found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*(mm|%)", text.strip())
+        if not found or not 0 < float(found[1]) < 100:
+            raise IgaDrakeError(
+                f"tolerance '{text}': a length or a share of the size such as 2mm or 1% expected"
+            )
+        scale = 0.01 if found[2] == "%" else 0.001
+        return SurfaceTolerance(found[1] + found[2], scale * float(found[1]), found[2] == "%")
+
+    def within(self, size: float) -> float:
+        """In metres, of an object of that longest extent (m)."""
+        return self.value * size if self.relative else self.value
+
+
+def equivalents(
+    sample: Sample, *, symmetry: bool, tolerance: SurfaceTolerance | None = None
+) -> np.ndarray:
     """(n, 4, 4) motions in W of the test pair's A that end in a valid alignment.
 
     With `symmetry` also those that differ by the symmetries of the families and by those found on
-    the surfaces themselves (of samples made with `test_surface`).
+    the surfaces themselves (of samples made with `test_surface`), to within a tolerance (default:
+    that of `symmetry_search`).
     """
     motions = sample.modes
     if not symmetry:
         return motions
-    of_A, of_B = known_symmetries(sample)
+    of_A, of_B = known_symmetries(sample, tolerance)
     # B's symmetry turns what stands around it; A's turns A in its place.
     motions = motions[:, None] @ of_A[None]
     return (of_B[:, None, None] @ motions[None]).reshape(-1, 4, 4)
 
 
-def known_symmetries(sample: Sample) -> tuple[np.ndarray, np.ndarray]:
+def known_symmetries(
+    sample: Sample, tolerance: SurfaceTolerance | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Motions (n, 4, 4) in W that carry the test pair's A, and B, onto itself: the family's and
     those found on its surface, the identity first."""
+    if tolerance is None:
+        surfaces = sample.found_symmetries
+    else:
+        A, B = (tolerance.within(float(size)) for size in sample.size[:, -1])
+        surfaces = sample.symmetries_within(A, B)
     of_A, of_B = (
         np.concatenate((_turns(group, axis), found[1:]))
-        for group, axis, found in zip(
-            sample.symmetries, sample.axes, sample.found_symmetries, strict=True
-        )
+        for group, axis, found in zip(sample.symmetries, sample.axes, surfaces, strict=True)
     )
     return of_A, of_B
 

@@ -8,6 +8,7 @@ canonical instance, in units of that instance's size.
 Frames: O, a shape's own; C, of the canonical pair (B as in its O); W, of one observed pair.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
 
@@ -15,12 +16,13 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from iga_drake.dataset.collections import collection_keys, collection_mesh
+from iga_drake.dataset.collections import collection_keys, collection_mesh, own_keys, own_mesh
 from iga_drake.dataset.depth_camera import CALIBRATION, Clouds, observe
 from iga_drake.dataset.depth_noise import DepthNoise
 from iga_drake.dataset.field import CLUTTER, FieldCloud, FieldConfig, disturb
-from iga_drake.dataset.relations import RelatedPairs, related_categories, related_pairs
+from iga_drake.dataset.relations import related_categories, related_pairs
 from iga_drake.dataset.splits import SampleSet, family_names, sample_set
+from iga_drake.dataset.stated_relations import StatedPairs, stated_pairs
 from iga_drake.errors import IgaDrakeError
 from iga_drake.geometry.rigid_fit import rigid_fit
 from iga_drake.shapes.composite import CompositeCategory
@@ -28,7 +30,7 @@ from iga_drake.shapes.deformers import DeformableShape, Deformer, LatticeDeforme
 from iga_drake.shapes.families import FAMILIES
 from iga_drake.shapes.surfaces import Surface
 from iga_drake.shapes.symmetry import NO_SYMMETRY, Symmetry
-from iga_drake.shapes.symmetry_search import find_symmetries
+from iga_drake.shapes.symmetry_search import TOLERANCE, find_symmetries
 
 COMPOSITE = "composite"
 CAMERAS = 3
@@ -70,6 +72,13 @@ class SampleConfig:
     # and the share of the objects that are.
     meshes: str = ""
     mesh_share: float = 1.0
+    # Where meshes keep their own sizes: metres per unit of the files (0: objects are drawn in any
+    # size), the files' axis that points up ("": y for glTF, else z), and keys that aren't drawn.
+    mesh_unit: float = 0.0
+    mesh_up: str = ""
+    mesh_without: tuple[str, ...] = ()
+    # A file of relations between meshes (`stated_relations.py`), for sets of relations.
+    relations: str = ""
     # Keep the test pair's surface, of which symmetries can be found.
     test_surface: bool = False
 
@@ -104,6 +113,9 @@ class Sample:
     canonical_surface: np.ndarray = field(
         default_factory=lambda: np.empty((2, 0, 2, 3), np.float32)
     )
+    # (2, S, 2, 3) m: evenly dense points and normals of the canonical instances, in their frames;
+    # S = 0 but for meshes in their own sizes.
+    form: np.ndarray = field(default_factory=lambda: np.empty((2, 0, 2, 3), np.float32))
 
     @property
     def symmetries(self) -> tuple[Symmetry, Symmetry]:
@@ -117,20 +129,26 @@ class Sample:
 
         Without a `surface` there is the identity alone.
 
-        Instances of a composite are one form under deformations that tell nothing of it: what
-        carries the canonical one onto itself counts as well, as near as the test instance has it.
+        Instances of a composite or of a mesh are one form under deformations that tell nothing of
+        it: what carries the canonical one onto itself counts as well, as near as the test instance
+        has it.
         """
+        return self.symmetries_within(TOLERANCE, TOLERANCE)
+
+    def symmetries_within(self, of_A: float, of_B: float) -> tuple[np.ndarray, np.ndarray]:
+        """`found_symmetries` with other tolerances (m), for A's surface and for B's."""
         if not self.surface.shape[1]:
             return np.eye(4)[None], np.eye(4)[None]
-        A, B = (self._found(role) for role in range(2))
+        A, B = (self._found(role, tolerance) for role, tolerance in enumerate((of_A, of_B)))
         return A, B
 
-    def _found(self, role: int) -> np.ndarray:
-        own = find_symmetries(*np.moveaxis(self.surface[role], 1, 0))
-        if self.category[role] != COMPOSITE or not self.canonical_surface.shape[1]:
+    def _found(self, role: int, tolerance: float) -> np.ndarray:
+        own = find_symmetries(*np.moveaxis(self.surface[role], 1, 0), tolerance=tolerance)
+        if self.category[role] in FAMILIES or not self.canonical_surface.shape[1]:
             return own
-        points, normals = np.moveaxis(self.canonical_surface[role], 1, 0)
-        turns = find_symmetries(points, normals)[1:]
+        form = self.form if self.form.shape[1] else self.canonical_surface
+        turns = find_symmetries(*np.moveaxis(form[role], 1, 0), tolerance=tolerance)[1:]
+        points = self.canonical_surface[role, :, 0]
         return np.concatenate((own, _carried(turns, points, self.surface[role, :, 0])))
 
 
@@ -155,6 +173,8 @@ class _Object:
     spacing: np.ndarray  # (N + 1,) m between neighbouring points
     axis: np.ndarray  # (2, 3) of the test instance: point and direction
     up: np.ndarray  # (3,) in every instance's own frame, or 0
+    form: np.ndarray | None = None  # (S, 2, 3), see `Sample.form`
+    corresponding: bool = True  # whether the points are the same on all instances
 
 
 def make_sample(split: str, index: int, config: SampleConfig | None = None) -> Sample:
@@ -165,14 +185,25 @@ def make_sample(split: str, index: int, config: SampleConfig | None = None) -> S
     config = config or SampleConfig()
     chosen = sample_set(split)
     k = stream_index(chosen, index, config)
-    if chosen.views == 1:
+    modes: list[_Alignment] | list[_Related]
+    if config.relations:
+        pairs = stated_pairs(chosen, k, config.relations)
+        objects = [_stated(chosen, k, role, pairs, config) for role in range(2)]
+    elif chosen.views == 1:
         objects = [_instances(chosen, k, role, config) for role in range(2)]
     else:
         shown = object_index(chosen, k)
         objects = [_remembered(chosen.name, shown, role, config) for role in range(2)]
-    modes: list[_Alignment] | list[_Related]
-    if chosen.relations:
-        modes = [_Related(related_pairs(chosen, k, SIZE), objects, config)]
+    if config.relations:
+        none = np.zeros(config.surface_points, bool)
+        modes = [_Related(pairs.X_BA, (none, none))]
+    elif chosen.relations:
+        related = related_pairs(chosen, k, SIZE)
+        near = [
+            _near(shape.points[0], place, config)
+            for shape, place in zip(objects, related.places, strict=True)
+        ]
+        modes = [_Related(related.X_BA[1:], near)]
     else:
         modes = [_Alignment(chosen, k, mode, objects, config) for mode in range(chosen.modes)]
     for attempt in range(ATTEMPTS):
@@ -180,8 +211,9 @@ def make_sample(split: str, index: int, config: SampleConfig | None = None) -> S
         if sample is not None:
             return sample
     raise SampleError(
-        f"sample {index} of '{split}': the cameras see too little of its objects in {ATTEMPTS} "
-        "arrangements: are there meshes that are too small or too thin?"
+        f"sample {index} of '{split}': the cameras see too little of its objects "
+        f"({' and '.join(shape.category for shape in objects)}) in {ATTEMPTS} arrangements: are "
+        "there meshes that are too small or too thin?"
     )
 
 
@@ -211,12 +243,20 @@ def _category(
     """The category's name and the generator that draws a composite's structure."""
     rng = chosen.rng("categories", k, role)
     if config.meshes and rng.random() < config.mesh_share:
-        names = collection_keys(config.meshes, chosen.families)
+        names = _mesh_names(chosen.families, config)
     elif rng.random() < chosen.composite_share:
         return COMPOSITE, rng
     else:
         names = family_names(chosen.families)
     return names[int(rng.integers(len(names)))], rng
+
+
+@cache
+def _mesh_names(families: str, config: SampleConfig) -> tuple[str, ...]:
+    """Keys of the meshes that are drawn."""
+    if config.mesh_unit:
+        return own_keys(config.meshes, config.mesh_unit, config.mesh_up, config.mesh_without)
+    return collection_keys(config.meshes, families)
 
 
 def _symmetry(category: str) -> Symmetry:
@@ -263,7 +303,33 @@ def _instances(chosen: SampleSet, k: int, role: int, config: SampleConfig) -> _O
         up *= related_pairs(chosen, k, SIZE).relation.upright[role]
     elif category == COMPOSITE or lies.random() >= STANDING:
         up = _direction(lies)
-    return _Object(category, *surface, axis, up)
+    form = None
+    if config.mesh_unit and category not in FAMILIES:
+        even = chosen.rng("instances", k, role, chosen.pairs + 3)
+        points, normals, _ = surface_points(even, vertices[:1], faces, config.surface_points)
+        form = np.stack((points[0], normals[0]), 1)
+    return _Object(category, *surface, axis, up, form)
+
+
+def _stated(
+    chosen: SampleSet, k: int, role: int, pairs: StatedPairs, config: SampleConfig
+) -> _Object:
+    """The meshes of one role of a stated relation; the test pair's stands for the canonical one.
+
+    No point of one mesh has a counterpart on another.
+    """
+    meshes = (pairs.meshes[role][-1], *pairs.meshes[role])
+    drawn = [
+        surface_points(
+            chosen.rng("instances", k, role, n), mesh.vertices[None], mesh.faces,
+            config.surface_points,
+        )
+        for n, mesh in enumerate(meshes)
+    ]  # fmt: skip
+    points, normals, spacing = (np.concatenate(each) for each in zip(*drawn, strict=True))
+    up = np.array([0.0, 0.0, float(pairs.upright[role])])
+    axis = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    return _Object(meshes[-1].key, points, normals, spacing, axis, up, corresponding=False)
 
 
 @lru_cache(maxsize=2 * _APART)
@@ -291,7 +357,7 @@ def instance_meshes(
     levels[0] = 0.0
     independent = base.random() < chosen.independent_share
     deformation = _DEFORMATIONS[int(base.choice(len(_DEFORMATIONS), p=config.deformations))]
-    target = np.exp(base.uniform(*np.log(CANONICAL_SIZE)))
+    target, sizes = float(np.exp(base.uniform(*np.log(CANONICAL_SIZE)))), SIZE
     cells = int(base.integers(3, 5))
     symmetry = _symmetry(category)
     # Part-wise deformation starts from the same product; else the products differ too.
@@ -314,7 +380,13 @@ def instance_meshes(
                 parameters = family.vary_parameters(product, rng, 0.5 * spread)
             surfaces.append(family.surface(parameters))
     else:  # the instances of a mesh are its deformations
-        surfaces = [Surface(*collection_mesh(config.meshes, category))] * len(each)
+        if config.mesh_unit:
+            mesh = own_mesh(config.meshes, category, config.mesh_unit, config.mesh_up)
+            surface = Surface(mesh.vertices, mesh.faces)
+            target, sizes = float(np.ptp(mesh.vertices, axis=0).max()), (0.0, np.inf)
+        else:
+            surface = Surface(*collection_mesh(config.meshes, category))
+        surfaces = [surface] * len(each)
         deformation = "lattice" if deformation == "none" else deformation
     vertices, faces = np.stack([surface[0] for surface in surfaces]), surfaces[0][1]
     rest = vertices[-1].copy()
@@ -326,7 +398,7 @@ def instance_meshes(
             vertices[n] = deformer.deform(shape, int(each[n].integers(1 << 31)))
     # One factor for all: instances keep their sizes relative to the canonical one.
     extent = np.ptp(vertices, axis=1).max(1)
-    factors = np.clip(target / extent[0] * extent, *SIZE) / extent
+    factors = np.clip(target / extent[0] * extent, *sizes) / extent
     vertices = vertices * factors[:, None, None]
     axis = np.stack((np.zeros(3), symmetry.direction))
     if not symmetry.is_trivial:
@@ -419,8 +491,7 @@ class _Alignment:
         for shape in objects:
             canonical = shape.points[0]
             pick = int(rng.integers(len(canonical)))
-            distance = np.linalg.norm(canonical - canonical[pick], axis=1)
-            near = distance <= np.quantile(distance, config.neighbourhood)
+            near = _near(canonical, canonical[pick], config)
             self.near.append(near)
             self.poses.append(rigid_fit(shape.points[1:, near], canonical[near]))
             picks.append(pick)
@@ -432,14 +503,17 @@ class _Alignment:
 class _Related:
     """The relation of different products, as `_Alignment`; C is B's own frame."""
 
-    def __init__(self, pairs: RelatedPairs, objects: list[_Object], config: SampleConfig):
-        self.near = []
-        for shape, place in zip(objects, pairs.places, strict=True):
-            distance = np.linalg.norm(shape.points[0] - place, axis=1)
-            self.near.append(distance <= np.quantile(distance, config.neighbourhood))
-        X_BA = pairs.X_BA[1:]
+    def __init__(self, X_BA: np.ndarray, near: Sequence[np.ndarray]):
+        """X_BA (N, 4, 4); `near` (S,) bool of A and of B: the neighbourhoods that are aligned."""
+        self.near = list(near)
         own = np.tile(np.eye(3), (len(X_BA), 1, 1))
         self.poses = [(X_BA[:, :3, :3], X_BA[:, :3, 3]), (own, np.zeros((len(X_BA), 3)))]
+
+
+def _near(points: np.ndarray, place: np.ndarray, config: SampleConfig) -> np.ndarray:
+    """(S,) bool: the share of the points (S, 3) that is nearest to a place (3,)."""
+    distance = np.linalg.norm(points - place, axis=1)
+    return distance <= np.quantile(distance, config.neighbourhood)
 
 
 def _rotation(rng: np.random.Generator) -> np.ndarray:
@@ -567,8 +641,13 @@ def _observe(
     test_A, test_B = poses[:, -1]
     surface = np.stack((points[-1], normals[-1]), 2).astype(np.float32)
     canonical_surface = np.stack([np.stack((o.points[0], o.normals[0]), 1) for o in objects])
+    forms = [shape.form for shape in objects if shape.form is not None]
+    if len(forms) < 2 or not config.test_surface:
+        forms = [np.empty((0, 2, 3))] * 2
     if not config.test_surface:
-        surface, canonical_surface = surface[:, :0], canonical_surface[:, :0]
+        surface = surface[:, :0]
+    if not config.test_surface or not all(shape.corresponding for shape in objects):
+        canonical_surface = canonical_surface[:, :0]
     return Sample(
         points=observed,
         canonical=place,
@@ -582,6 +661,7 @@ def _observe(
         category=(objects[0].category, objects[1].category),
         surface=surface,
         canonical_surface=canonical_surface.astype(np.float32),
+        form=np.stack(forms).astype(np.float32),
     )
 
 

@@ -8,13 +8,18 @@ demonstrations show several alignments, the nearest one counts. Two kinds of err
 - modulo symmetry: where A or B is (nearly) symmetric, by its family or by chance, against the
   nearest of the alignments that are the same up to the symmetry.
 
+The second kind can be taken at several tolerances of what counts as symmetric, in mm or as a share
+of the object's size. The objects are those of the sets, or a user's own: deformed meshes of a
+folder, or different instances in stated relations.
+
 An answer whose rotation is off by more than `FLIP` is a flip. The objects' ways up are given to the
 aligner in sets of relations, in others only on demand.
 """
 
+import dataclasses
 import time
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +30,26 @@ from iga_drake.aligners.protocol import Aligner
 from iga_drake.aligners.query import sample_query
 from iga_drake.aligners.registry import ORACLE
 from iga_drake.checkpoint import file_digest, load_checkpoint
-from iga_drake.dataset.alignment_error import CONFIG, equivalents, nearest_error
+from iga_drake.dataset.alignment_error import (
+    CONFIG,
+    SurfaceTolerance,
+    equivalents,
+    nearest_error,
+)
+from iga_drake.dataset.collections import collection_digest
 from iga_drake.dataset.field_versions import FIELD_KINDS
 from iga_drake.dataset.oracle import oracle_pose
-from iga_drake.dataset.samples import make_sample
+from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.dataset.splits import sample_set, sample_sets
+from iga_drake.dataset.stated_relations import read_relations
 from iga_drake.errors import IgaDrakeError
-from iga_drake.evaluation.results import ResultsStore, aligner_key, code_key, config_digest
+from iga_drake.evaluation.results import (
+    ResultsStore,
+    aligner_key,
+    code_key,
+    config_digest,
+    text_digest,
+)
 from iga_drake.progress import progress
 
 FIVE_SETS = (
@@ -42,6 +60,8 @@ FIVE_SETS = (
     "multi_modal",
 )
 EVALUATION_SETS = (*FIVE_SETS, "cross_instance")
+OWN_OBJECTS, OWN_RELATIONS = "own_objects", "own_relations"  # sets of a user's meshes
+TOLERANCES = ("1mm", "2mm", "5mm")  # at which their symmetry is taken
 THRESHOLDS = ((0.01, 5.0), (0.02, 10.0), (0.03, 15.0))  # m, deg
 FLIP = 45.0  # deg
 CLOSE = 1  # of THRESHOLDS, by which a field version is compared with the clean set
@@ -68,6 +88,8 @@ class SampleErrors:
     seconds: float
     up: bool = False  # whether the objects' ways up were given
     field: str = ""  # one of FIELD_KINDS; none: clean
+    # Errors modulo symmetry at other tolerances, by the tolerance's text.
+    at: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     reused: bool = False  # measured before, and found in a results file
 
 
@@ -123,19 +145,25 @@ class AlignmentErrors:
     reused: int  # how many of the errors were found in a results file
     up: bool = False
     field: str = ""
+    at: Mapping[str, Errors] = dataclasses.field(
+        default_factory=dict
+    )  # modulo, by the tolerance's text
 
     def ratio(self, clean: "AlignmentErrors") -> float:
         """Share within 2 cm and 10 degrees, modulo symmetry, as a share of that of clean clouds."""
         return self.modulo.success[CLOSE] / max(clean.modulo.success[CLOSE], 1e-9)
 
     def rows(self) -> str:
-        """Two lines of the table under `HEADER`: plain, and modulo symmetry."""
+        """Lines of the table under `HEADER`: plain, and modulo symmetry at each tolerance."""
         name = " ".join(filter(None, (self.split, self.field, "up" if self.up else "")))
         first = f"{self.aligner:<8} {name:<24} {self.count:>5}"
         reused = f"  {self.reused} reused" if self.reused else ""
-        return (
-            f"{first}  plain   {self.plain.columns()}  {self.seconds_median:6.2f}{reused}\n"
-            f"{'':<39}  modulo  {self.modulo.columns()}"
+        modulo = {"modulo": self.modulo, **self.at}
+        return "\n".join(
+            [
+                f"{first}  plain   {self.plain.columns()}  {self.seconds_median:6.2f}{reused}",
+                *(f"{'':<39}  {name:<6}  {errors.columns()}" for name, errors in modulo.items()),
+            ]
         )
 
 
@@ -143,13 +171,20 @@ HEADER = f"{'aligner':<8} {'set':<24} {'count':>5}  {'error':<6}  {COLUMNS}   s"
 
 
 def evaluate_sample(
-    aligner: Aligner | None, split: str, index: int, *, up: bool = False, field: str = ""
+    aligner: Aligner | None,
+    split: str,
+    index: int,
+    *,
+    up: bool = False,
+    field: str = "",
+    config: SampleConfig = CONFIG,
+    tolerances: Sequence[SurfaceTolerance] = (),
 ) -> SampleErrors | None:
     """The errors of an aligner on sample `index` of a set (see `sample_query`).
 
     Without an aligner the oracle answers, of the clean clouds; None if it has no answer.
     """
-    sample = make_sample(split, index, CONFIG)
+    sample = make_sample(split, index, config)
     test = sample.points[0, -1]
     began = time.perf_counter()
     if aligner is None:
@@ -176,7 +211,52 @@ def evaluate_sample(
         seconds=seconds,
         up=up,
         field=field,
+        at={
+            each.text: nearest_error(
+                motion, equivalents(sample, symmetry=True, tolerance=each), test
+            )
+            for each in tolerances
+        },
     )
+
+
+def own_objects(
+    *,
+    meshes: str = "",
+    relations: str = "",
+    unit: float = 1.0,
+    up: str = "",
+    without: Sequence[str] = (),
+) -> tuple[str, SampleConfig]:
+    """The set and the options by which samples show a user's own objects.
+
+    Args:
+      meshes: a folder, ShapeNetCore.v2 or package, whose objects are deformed; or
+      relations: a file of relations between different ones (see `stated_relations`).
+      unit: metres per unit of the mesh files.
+      up: their axis that points up; "": y for glTF, else z.
+      without: keys of meshes that are left out.
+    """
+    if relations:
+        return OWN_RELATIONS, replace(CONFIG, relations=relations)
+    return OWN_OBJECTS, replace(
+        CONFIG, meshes=meshes, mesh_unit=unit, mesh_up=up, mesh_without=tuple(without)
+    )
+
+
+def _config_key(config: SampleConfig) -> str:
+    """Digest of the options and of the content of the files that they name."""
+    content = ""
+    if config.relations:
+        file = Path(config.relations)
+        content = file.read_text(encoding="utf-8") + collection_digest(
+            read_relations(config.relations).source
+        )
+        config = replace(config, relations="relations")
+    elif config.meshes:
+        content = collection_digest(config.meshes)
+        config = replace(config, meshes="meshes")
+    return config_digest(config) + (text_digest(content) if content else "")
 
 
 def evaluate_alignment(
@@ -188,13 +268,16 @@ def evaluate_alignment(
     field: str = "",
     options: Mapping[str, Any] | None = None,
     store: ResultsStore | None = None,
+    config: SampleConfig = CONFIG,
+    tolerances: Sequence[SurfaceTolerance] = (),
 ) -> tuple[AlignmentErrors, list[SampleErrors]]:
     """Aligns the first `count` samples of a set; every aligner gets the same samples and starts.
 
     Without an aligner the oracle answers; samples on which it has no answer are left out of the
     means and of the count. `up` and `field` as in `sample_query`; None gives the ways up in sets
     of relations alone. `options` are those that the aligner was made with; errors that the
-    store holds are taken from there, others put there. Raises `IgaDrakeError`.
+    store holds are taken from there, others put there. `config` has the objects (`own_objects`);
+    errors modulo symmetry are also taken at further `tolerances`. Raises `IgaDrakeError`.
     """
     if split not in sample_sets():
         raise IgaDrakeError(f"set '{split}' is not known; one of: {', '.join(sample_sets())}")
@@ -207,7 +290,8 @@ def evaluate_alignment(
     common = {
         "kind": "alignment",
         "set": split,
-        "config": config_digest(CONFIG),
+        "config": _config_key(config),
+        "tolerances": [each.text for each in tolerances],
         "up": given,
         "field": field,
         **aligner_key(aligner, name, options),
@@ -220,7 +304,9 @@ def evaluate_alignment(
         if known is not None:
             rows.append(SampleErrors(**known, reused=True))
             continue
-        row = evaluate_sample(aligner, split, index, up=given, field=field)
+        row = evaluate_sample(
+            aligner, split, index, up=given, field=field, config=config, tolerances=tolerances
+        )
         if row is None:
             continue
         if store:
@@ -247,6 +333,7 @@ def summarise_errors(rows: Iterable[SampleErrors]) -> AlignmentErrors:
         reused=sum(r.reused for r in rows),
         up=rows[0].up,
         field=rows[0].field,
+        at={name: Errors.of(*np.array([row.at[name] for row in rows]).T) for name in rows[0].at},
     )
 
 

@@ -1,6 +1,6 @@
 """Makes an object that can be simulated from a mesh file: with mass and pieces that collide."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ from iga_drake.shapes.convex_pieces import convex_pieces, hull_of, joined
 from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.instance import MassProperties, ShapeInstance, frame
 from iga_drake.shapes.mesh_cleaning import UP_AXES, MeshCleaning
-from iga_drake.shapes.readers import FORMATS, Y_UP_FORMATS, MeshEntry, read_mesh
+from iga_drake.shapes.readers import FORMATS, Y_UP_FORMATS, MeshEntry, MeshShape, read_mesh
 
 # Edge of the largest and the smallest box (m) that an object's bounds may be.
 LARGEST, SMALLEST = 2.0, 0.005
@@ -44,8 +44,6 @@ def read_mesh_object(path: Path, reading: MeshReading | None = None) -> ShapeIns
     reading = reading or MeshReading()
     if path.suffix.lower() not in FORMATS:
         raise ShapeError(f"{path}: no mesh of a known kind; use one of {', '.join(FORMATS)}")
-    if reading.up not in ("", *UP_AXES):
-        raise ShapeError(f"{path}: up: '{reading.up}' found, x, y or z expected")
     entry = MeshEntry(
         name=path.stem,
         category=path.parent.name,
@@ -53,25 +51,14 @@ def read_mesh_object(path: Path, reading: MeshReading | None = None) -> ShapeIns
         source=str(path),
         y_up=path.suffix.lower() in Y_UP_FORMATS,
     )
-    shape = read_mesh(entry, MeshCleaning(scale=reading.unit, up=reading.up, centre=False))
-    vertices = shape.vertices
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    size = " x ".join(f"{edge:.3g}" for edge in high - low)
-    if not SMALLEST <= (high - low).max() <= LARGEST:
-        raise ShapeError(
-            f"{path}: its bounds are {size} m with unit {reading.unit:g}, an object's longest edge "
-            f"is {SMALLEST} to {LARGEST} m: state its unit in metres, such as unit: 0.001 for "
-            "millimetres"
-        )
-    vertices = vertices - [*(low + high)[:2] / 2, low[2]]
-    mesh = trimesh.Trimesh(vertices=vertices, faces=shape.faces, process=False)
+    shape = read_standing_mesh(entry, reading.unit, reading.up)
+    mesh = trimesh.Trimesh(vertices=shape.vertices, faces=shape.faces, process=False)
     if len(mesh.faces) > _FACES:
         mesh = _decimated(path, mesh)
     try:
         pieces = _pieces(mesh, reading.pieces)
     except ShapeError as error:
         raise ShapeError(f"{path}: {error}") from error
-    height = float(high[2] - low[2])
     instance = ShapeInstance(
         family=path.stem,
         parameters={},
@@ -79,16 +66,39 @@ def read_mesh_object(path: Path, reading: MeshReading | None = None) -> ShapeIns
         faces=mesh.faces,
         part_labels=np.zeros(len(mesh.faces), dtype=np.int64),
         part_names=("surface",),
-        frames={
-            "base": frame((0.0, 0.0, 0.0)),
-            "centre": frame((0.0, 0.0, height / 2)),
-            "top": frame((0.0, 0.0, height)),
-        },
+        frames=bounds_frames(shape.vertices),
         convex_pieces=pieces,
         density=reading.density,
         stated_mass=None if shape.watertight else solid_mass(pieces, reading.density),
     )
     return instance if reading.mass is None else instance.with_mass(reading.mass)
+
+
+def read_standing_mesh(entry: MeshEntry, unit: float = 1.0, up: str = "") -> MeshShape:
+    """A mesh in its own size that stands on z = 0, the middle of its bounds on the z axis.
+
+    `unit` and `up` as in `MeshReading`. Raises `ShapeError` that names the file, the reason and a
+    remedy.
+    """
+    if up not in ("", *UP_AXES):
+        raise ShapeError(f"{entry.path}: up: '{up}' found, x, y or z expected")
+    shape = read_mesh(entry, MeshCleaning(scale=unit, up=up, centre=False))
+    low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
+    size = " x ".join(f"{edge:.3g}" for edge in high - low)
+    if not SMALLEST <= (high - low).max() <= LARGEST:
+        raise ShapeError(
+            f"{entry.path}: its bounds are {size} m with unit {unit:g}, an object's longest edge "
+            f"is {SMALLEST} to {LARGEST} m: state its unit in metres, such as unit: 0.001 for "
+            "millimetres"
+        )
+    return replace(shape, vertices=shape.vertices - [*(low + high)[:2] / 2, low[2]])
+
+
+def bounds_frames(vertices: np.ndarray) -> dict[str, np.ndarray]:
+    """X_OF (4, 4) of the frames `base`, `centre` and `top` of an object that stands on z = 0."""
+    height = float(vertices[:, 2].max())
+    places = {"base": 0.0, "centre": height / 2, "top": height}
+    return {name: frame((0.0, 0.0, z)) for name, z in places.items()}
 
 
 def solid_mass(pieces: tuple[np.ndarray, ...], density: float) -> MassProperties:

@@ -15,6 +15,7 @@ from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.checkpoint import load_checkpoint
 from iga_drake.dataset.alignment_error import (
     CONFIG,
+    SurfaceTolerance,
     equivalents,
     nearest_error,
     pose_errors,
@@ -22,7 +23,13 @@ from iga_drake.dataset.alignment_error import (
 )
 from iga_drake.dataset.samples import make_sample
 from iga_drake.errors import IgaDrakeError
-from iga_drake.evaluation.alignment import Errors, by_category, evaluate_alignment, model_card
+from iga_drake.evaluation.alignment import (
+    Errors,
+    by_category,
+    evaluate_alignment,
+    model_card,
+    own_objects,
+)
 from iga_drake.evaluation.results import ResultsStore
 from iga_drake.shapes.families import FAMILIES
 
@@ -220,6 +227,49 @@ def test_the_model_card_tells_what_the_file_says() -> None:
     text = model_card(default_weights(), [row])
     assert f"{card['samples_seen']:,} samples" in text
     assert row.rows() in text and "learning_rate" in text
+
+
+def test_errors_on_own_objects_are_taken_at_tolerances_and_kept_by_content(tmp_path: Path) -> None:
+    """A bar of 60 by 66 mm: a quarter turn is right where 5 mm don't count."""
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    block = trimesh.creation.box((0.06, 0.066, 0.14))
+    block.export(meshes / "block.stl")
+    split, config = own_objects(meshes=str(meshes))
+    tolerances = [SurfaceTolerance.of(text) for text in ("1mm", "5mm")]
+    store = ResultsStore(tmp_path / "results.jsonl")
+    arguments = {"config": config, "tolerances": tolerances, "store": store}
+    row, _ = evaluate_alignment(_Fixed(np.eye(4)), split, 2, **arguments)
+    assert list(row.at) == ["1mm", "5mm"] and "5mm" in row.rows()
+    assert all(at.translation_mean < 1e-4 for at in row.at.values())
+    sample = make_sample(split, 0, config)
+    turns = sample.symmetries_within(0.005, 0.005)[0]
+    angles = Rotation.from_matrix(turns[:, :3, :3]).magnitude()
+    turn = turns[np.abs(angles - np.pi / 2).argmin()]
+    aligner = _Fixed(turn)
+    aligner.name = "turned"
+    row, _ = evaluate_alignment(aligner, split, 1, **arguments)
+    assert row.at["5mm"].rotation_mean < 1 and row.at["1mm"].rotation_mean > 70
+    again, _ = evaluate_alignment(aligner, split, 1, **arguments)
+    assert again.reused == 1 and again.at == row.at and aligner.calls == 1
+    block.apply_translation((0, 0, 1)).export(meshes / "block.stl")  # another file, same name
+    row, _ = evaluate_alignment(aligner, split, 1, **arguments)
+    assert row.reused == 0
+
+
+def test_own_objects_and_our_sets_do_not_go_together(tmp_path: Path, capsys) -> None:
+    trimesh.creation.box((0.1, 0.1, 0.2)).export(tmp_path / "box.stl")
+    for arguments, message in (
+        (("--meshes", tmp_path, "--sets", "easy"), "leave out --meshes"),
+        (("--relations", tmp_path / "r.yaml", "--unit", "0.001"), "the file of --relations states"),
+        (("--meshes", tmp_path, "--unit", "-1"), "must be positive"),
+        (("--meshes", tmp_path, "--tolerances", "2"), "such as 2mm or 1%"),
+        (("--meshes", tmp_path / "none"), "no such folder"),
+        (("--relations", tmp_path / "none.yaml"), "No such file"),
+    ):
+        command = ["evaluate", "alignment", "--aligner", "oracle,icp", *map(str, arguments)]
+        assert cli.main(command) == cli.BAD_INPUT
+        assert message in capsys.readouterr().err
 
 
 def test_the_model_card_of_a_peer_is_of_its_own_weights(tmp_path: Path, capsys) -> None:
