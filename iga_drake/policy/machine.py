@@ -88,7 +88,7 @@ class PolicyConfig:
     # refuses nothing.
     minimum_familiarity: float = 0.5
     # Least `PoseEstimate.confidence`, in [0, 1]: below it the policy refuses. 0 refuses nothing.
-    minimum_confidence: float = 0.1
+    minimum_confidence: float = 0.05
     # Whether aligners are told which way is up for the objects that the task says are upright
     # (`ObservationPlan.upright`), where all demonstrations say so too. To be switched off where
     # such objects may lie on their side; demonstrations recorded then don't call them upright.

@@ -153,7 +153,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--threshold", type=float, default=0.5, help="least familiarity (default 0.5)"
     )
     parser.add_argument(
-        "--confidence", type=float, default=0.1, help="least confidence (default 0.1)"
+        "--confidence", type=float, default=0.05, help="least confidence (default 0.05)"
     )
     parser.add_argument("--json", action="store_true", help="every familiarity and confidence")
 
