@@ -167,13 +167,20 @@ class LiberoScene:
     def reachable(self, X_WE: np.ndarray) -> bool:
         """Whether the arm, within its joints' limits, can bring the hand to a pose.
 
-        Found from where it is by damped least squares. Collisions aren't looked at.
+        Found by damped least squares from where it is, or from where it began: a stretched arm
+        finds no way to poses near its base. Collisions aren't looked at.
         """
+        robot = self._env.robots[0]
+        now = self._sim.data.qpos[robot._ref_joint_pos_indexes]
+        return any(self._reaches(X_WE, start) for start in (now, robot.init_qpos))
+
+    def _reaches(self, X_WE: np.ndarray, start: np.ndarray) -> bool:
         mujoco = self._mujoco
         model, robot = self._model._model, self._env.robots[0]
         data = self._scratch
         data.qpos[:] = self._sim.data.qpos
         q, v = robot._ref_joint_pos_indexes, robot._ref_joint_vel_indexes
+        data.qpos[q] = start
         low, high = np.array([model.jnt_range[model.dof_jntid[k]] for k in v]).T
         site = self._model.site_name2id(_GRIP_SITE)
         J = np.zeros((6, model.nv))
