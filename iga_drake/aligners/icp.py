@@ -10,7 +10,6 @@ registrations. Where an object's way up is known, its registrations start from t
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate, check_question
 from iga_drake.demonstrations.alignment import Alignment, check_direction
@@ -66,6 +65,8 @@ def _descended(
     Returns rotations and shifts of those that were not given up, and their symmetric mean distances
     (m), the best first.
     """
+    from scipy.spatial import cKDTree  # aligners are listed without it
+
     onto, back = cKDTree(goal), cKDTree(source)
     p = goal.mean(0) - R @ source.mean(0)
 

@@ -11,7 +11,7 @@ from iga_drake import cli
 # Options that name files or folders to read. Every other one that takes a path is an output.
 INPUTS = {
     "--calibration", "--compare", "--config", "--demonstrations", "--descriptor", "--encoder",
-    "--energy", "--initial", "--weights",
+    "--energy", "--initial", "--relations", "--weights",
 }  # fmt: skip
 OUTPUTS = {
     "--card", "--energy-card", "--half", "--html", "--junit", "--markdown", "--out", "--png",

@@ -197,4 +197,4 @@ def test_the_landed_weights_beat_icp_by_far(aligner: IgaAligner) -> None:
     )
     assert ours.rotation_mean < 0.6 * icp.rotation_mean
     assert ours.rotation_median < icp.rotation_median
-    assert ours.translation_median < 0.8 * icp.translation_median
+    assert ours.translation_mean < 0.6 * icp.translation_mean
