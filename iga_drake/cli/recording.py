@@ -33,7 +33,7 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def log_request(arguments: argparse.Namespace) -> "LogRequest | None":
-    """What the options of `add_record_arguments` ask for."""
+    """The log that `--record` and `--image-period` ask for; None without `--record`."""
     from iga_drake.errors import check_range
     from iga_drake.tasks.episode import LogRequest
 

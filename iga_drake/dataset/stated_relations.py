@@ -73,7 +73,7 @@ class StatedRelation:
 
 @dataclass(frozen=True)
 class RelationFile:
-    """What a file states."""
+    """The content of a file of relations between instances of one's own categories."""
 
     source: str  # the collection of its meshes
     unit: float
@@ -130,7 +130,7 @@ def stated_pairs(chosen: SampleSet, k: int, file: str) -> StatedPairs:
 
 @lru_cache(maxsize=8)
 def read_relations(file: str) -> RelationFile:
-    """What a file of relations states, with all of its meshes read.
+    """Reads and checks a file of relations and all of its meshes.
 
     Raises `RelationError` that names the file and the key; `ShapeError` where there are no meshes.
     """

@@ -92,7 +92,7 @@ def multilaterate(
 
 
 class Multilateration(NamedTuple):
-    """What the network says of S problems with M nodes an object and D demonstrations."""
+    """The output of `RelDistNet` for S problems: M nodes of each object, D demonstrations."""
 
     logits: Tensor  # (2 S, D, M, M) of matches of the test's nodes with a demonstration's
     distance: Tensor  # (S, M, M) m that A's nodes have to be from B's

@@ -105,7 +105,7 @@ class CrossBlock(nn.Module):
 
 
 class CrossPose(NamedTuple):
-    """What the network says of S pairs, in the objects' own frames."""
+    """The output of `TaxPoseNet` for S pairs of objects, in the objects' own frames."""
 
     of_A: Tensor  # (S, P, 3) m, in B's frame: where A's points belong
     of_B: Tensor  # (S, P, 3) m, in A's frame: which places of A's belong to B's points
@@ -177,8 +177,13 @@ class OwnFrames:
 
     @staticmethod
     def of(points: Tensor, pose: Tensor) -> "OwnFrames":
-        """Of furthest point samples (S, 2, D + 1, P, 3) m in the pairs' frames, the last pair the
-        test; `pose` (S, 2, D + 1, 4, 4) of each cloud's own frame there."""
+        """The same clouds in their own frames.
+
+        Args:
+          points: (S, 2, D + 1, P, 3) m, furthest point samples in the frames of the pairs: the
+            demonstrations, then the test.
+          pose: (S, 2, D + 1, 4, 4), each cloud's own frame in the frame of its pair.
+        """
         half = points.shape[-2] // 2
         shown = transform(inverse(pose[:, 1:, :-1]), points[:, :, :-1, :half])
         A, B = transform(inverse(pose[:, :, -1]), points[:, :, -1]).unbind(1)
