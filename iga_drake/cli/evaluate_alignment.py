@@ -166,7 +166,7 @@ def _write_cards(arguments: argparse.Namespace, summaries: list) -> None:
     from iga_drake.aligners.iga.aligner import default_energy, default_weights
     from iga_drake.aligners.iga.weights import DESCRIPTOR, ENERGY
     from iga_drake.aligners.peers import ALIGNERS as PEERS
-    from iga_drake.aligners.peers.networks import landed_weights
+    from iga_drake.aligners.peers.aligner import landed_weights
     from iga_drake.evaluation.alignment import model_card
 
     if arguments.card:

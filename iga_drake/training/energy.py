@@ -40,7 +40,7 @@ from iga_drake.training.energy_problems import (
     random_near,
 )
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
-from iga_drake.training.settings import TrainingError, replaced
+from iga_drake.training.settings import check_same_model, replaced
 
 NEAR, VOTE_NEAR, FAR = 0.03, 0.05, 0.04  # m
 ONE, MODES, VALIDATION = "train_energy", "train_energy_modes", "validation_energy"
@@ -252,11 +252,7 @@ def train_energy(
     saved = SavedState.read(output, KIND)
     if saved is not None:
         before = EnergySettings.of(output)
-        if model not in (None, before.model):
-            raise TrainingError(
-                f"{output / 'state.safetensors'}: has another model than the one asked for "
-                f"({before.model}): train in another folder"
-            )
+        check_same_model(output, model, before.model)
         model, config = before.model, config or before.training
     model, config = model or EnergyConfig(), config or EnergyTraining()
     maker = ProblemMaker(Path(descriptor or default_weights()), model)

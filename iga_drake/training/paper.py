@@ -46,7 +46,7 @@ from iga_drake.geometry.se3 import geodesic_angle, kabsch, rigid, so3_exp
 from iga_drake.paths import models_dir
 from iga_drake.precision import mixed_precision
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
-from iga_drake.training.settings import TrainingError, replaced
+from iga_drake.training.settings import TrainingError, check_same_model, replaced
 
 SEED_STRIDE = 10_000_000  # samples between the streams of two seeds
 FRAMES = ("own", "common")
@@ -529,11 +529,7 @@ def train_paper(
     saved = SavedState.read(output, kind_of(part))
     if saved is not None:
         before = _saved_settings(saved, output, part)
-        if model not in (None, before.model):
-            raise TrainingError(
-                f"{output / 'state.safetensors'}: has another model than the one asked for "
-                f"({before.model}): train in another folder"
-            )
+        check_same_model(output, model, before.model)
         model, config, samples = before.model, config or before.training, samples or before.samples
     model = model or default_model(part)
     config, samples = config or PaperTraining(), samples or SampleConfig()

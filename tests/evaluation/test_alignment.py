@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from iga_drake import cli
 from iga_drake.aligners.iga.aligner import default_weights
-from iga_drake.aligners.peers.networks import landed_weights
+from iga_drake.aligners.peers.aligner import landed_weights
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.checkpoint import load_checkpoint
 from iga_drake.dataset.alignment_error import (
