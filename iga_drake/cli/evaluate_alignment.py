@@ -163,18 +163,16 @@ def _own_objects(arguments: argparse.Namespace) -> dict[str, Any]:
 def _write_cards(arguments: argparse.Namespace, summaries: list) -> None:
     if not arguments.card and not arguments.energy_card:
         return
-    from iga_drake.aligners.iga.aligner import default_energy, default_weights
     from iga_drake.aligners.iga.weights import DESCRIPTOR, ENERGY
     from iga_drake.aligners.peers import ALIGNERS as PEERS
-    from iga_drake.aligners.peers.aligner import landed_weights
     from iga_drake.evaluation.alignment import model_card
+    from iga_drake.paths import landed_weights
 
     if arguments.card:
         name = arguments.aligner[0]
-        peer = len(arguments.aligner) == 1 and name in PEERS
-        landed, kind = (landed_weights(name), name) if peer else (default_weights(), DESCRIPTOR)
-        weights = Path(arguments.weights or landed)
+        kind = name if len(arguments.aligner) == 1 and name in PEERS else DESCRIPTOR
+        weights = Path(arguments.weights or landed_weights(kind))
         write_text(arguments.card, model_card(weights, summaries, kind=kind))
     if arguments.energy_card:
-        energy = Path(arguments.energy or default_energy())
+        energy = Path(arguments.energy or landed_weights(ENERGY))
         write_text(arguments.energy_card, model_card(energy, summaries, kind=ENERGY))

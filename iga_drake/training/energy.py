@@ -14,14 +14,12 @@ import copy
 import dataclasses
 import math
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from iga_drake.aligners.iga.aligner import default_weights
 from iga_drake.aligners.iga.energy import (
     Energy,
     EnergyConfig,
@@ -30,8 +28,11 @@ from iga_drake.aligners.iga.energy import (
     SearchConfig,
     minimise,
 )
+from iga_drake.aligners.iga.weights import DESCRIPTOR
 from iga_drake.aligners.iga.weights import ENERGY as KIND
+from iga_drake.checkpoint import file_digest
 from iga_drake.geometry.se3 import geodesic_angle, random_rotations, rigid, transform
+from iga_drake.paths import landed_weights
 from iga_drake.training.energy_problems import (
     ProblemMaker,
     Problems,
@@ -255,7 +256,7 @@ def train_energy(
         check_same_model(output, model, before.model)
         model, config = before.model, config or before.training
     model, config = model or EnergyConfig(), config or EnergyTraining()
-    maker = ProblemMaker(Path(descriptor or default_weights()), model)
+    maker = ProblemMaker(Path(descriptor or landed_weights(DESCRIPTOR)), model)
     folder = problems or output / "problems"
     sets = [
         make_problems(folder, split, count, maker, workers=workers).to(device)
@@ -283,7 +284,7 @@ def train_energy(
         saved=saved,
         card={
             "model": dataclasses.asdict(model),
-            "descriptor": sha256(maker.descriptor.read_bytes()).hexdigest()[:16],
+            "descriptor": file_digest(maker.descriptor),
         },
         options=options,
         validate=validate,

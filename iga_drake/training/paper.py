@@ -43,7 +43,7 @@ from iga_drake.dataset.loader import Batch, collate, sample_loader
 from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.dataset.splits import sample_sets
 from iga_drake.geometry.se3 import geodesic_angle, kabsch, rigid, so3_exp
-from iga_drake.paths import models_dir
+from iga_drake.paths import landed_weights
 from iga_drake.precision import mixed_precision
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
 from iga_drake.training.settings import TrainingError, check_same_model, replaced
@@ -492,13 +492,8 @@ def _generator(config: PaperTraining, number: int, device: torch.device | str) -
     return torch.Generator(device).manual_seed(seed)
 
 
-def default_encoder() -> Path:
-    """The landed checkpoint of the local encoder."""
-    return models_dir() / "weights" / "encoder.safetensors"
-
-
 def _new_model(part: str, config: GraphConfig, encoder: Path | None) -> PaperModel:
-    trained: LocalEncoder = load_encoder(encoder or default_encoder())[0].encoder
+    trained: LocalEncoder = load_encoder(encoder or landed_weights("encoder"))[0].encoder
     model = PaperModel(part, config, trained.config)
     model.encoder.load_state_dict(trained.state_dict())
     return model

@@ -17,14 +17,9 @@ from iga_drake.aligners.protocol import PoseEstimate, check_question
 from iga_drake.checkpoint import load_network, sizes_in_card, with_digest
 from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.geometry.se3 import nearest_rotation
-from iga_drake.paths import models_dir
+from iga_drake.paths import landed_weights
 
 PeerNetwork = TypeVar("PeerNetwork", bound=nn.Module)
-
-
-def landed_weights(name: str) -> Path:
-    """The weights of a peer that come with the package."""
-    return models_dir() / "weights" / f"{name}.safetensors"
 
 
 class PeerAligner(ABC, Generic[PeerNetwork]):
