@@ -29,6 +29,7 @@ def test_a_cluster_gives_the_same_samples_and_trials(tmp_path: Path, monkeypatch
         for arguments in (late, ("nowhere.yaml",))
     ]
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # else other tests go first
     try:
         ray.init(
             address="local",  # another one may run on this machine
