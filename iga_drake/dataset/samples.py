@@ -114,7 +114,7 @@ class Sample:
         default_factory=lambda: np.empty((2, 0, 2, 3), np.float32)
     )
     # (2, S, 2, 3) m: evenly dense points and normals of the canonical instances, in their frames;
-    # S = 0 unless the options say `test_surface`, and where a role's objects have no form in common.
+    # S = 0 unless the options say `test_surface`, and where a role's objects have different forms.
     form: np.ndarray = field(default_factory=lambda: np.empty((2, 0, 2, 3), np.float32))
 
     @property
