@@ -8,12 +8,13 @@ pace can rehearse everything else: all limits are in seconds of that clock.
 
 import contextlib
 import datetime
+import itertools
 import multiprocessing
 import os
 import signal
 import tempfile
 import time as wall
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -31,12 +32,14 @@ from pydrake.systems.lcm import LcmBuses, LcmInterfaceSystem
 from iga_drake.aligners.registry import EXPERT, ORACLE
 from iga_drake.errors import IgaDrakeError, error_text
 from iga_drake.policy.inference import Inference
+from iga_drake.policy.motion import Phase
 from iga_drake.station.cameras.rgbd import Pose
 from iga_drake.station.hardware.boot import boot_panda
 from iga_drake.station.hardware.calibration import CameraCalibration, write_calibration
 from iga_drake.station.hardware.images import CHANNEL, encode_images
 from iga_drake.station.hardware.station import build_hardware_station
 from iga_drake.station.lcm import check_receive_buffer, decoded, udp_url, utime_of
+from iga_drake.station.log.writer import EpisodeLogWriter
 from iga_drake.station.panda import messages
 from iga_drake.station.panda.driver import connect_server
 from iga_drake.station.panda.messages import ControlMode
@@ -114,36 +117,76 @@ class CellRequest:
 
 @dataclass(frozen=True)
 class Timing:
-    """How commands reached the arm, in milliseconds of the wall clock: median, 99 %, most."""
+    """How commands reached the arm; triples are median, 99th percentile and most, in milliseconds
+    of the wall clock."""
 
     count: int
-    # Difference of the time between two commands from the control period.
+    # From the first to the last, in seconds of the rehearsal's clock.
+    seconds: float
+    # Difference of the time between two commands from the control period: of all, and of those that
+    # came while an aligner was at work.
     jitter: tuple[float, float, float]
+    jitter_inferring: tuple[float, float, float]
     # From a command's stamp to its arrival.
     latency: tuple[float, float, float]
+    # How often a driver's watchdog would have run out: no command for `expiry`, or one that was
+    # older than that when it came.
+    missed: int
+
+    def row(self) -> dict[str, Any]:
+        """The timing as plain JSON values."""
+        return {
+            "commands": self.count,
+            "command_seconds": self.seconds,
+            "jitter_ms": list(self.jitter),
+            "jitter_inferring_ms": list(self.jitter_inferring),
+            "latency_ms": list(self.latency),
+            "missed": self.missed,
+        }
 
     def __str__(self) -> str:
         def words(values: tuple[float, float, float]) -> str:
             return " / ".join(f"{value:.2f}" for value in values)
 
         return (
-            f"{self.count} commands; median / 99 % / most: jitter {words(self.jitter)} ms, "
-            f"latency {words(self.latency)} ms"
+            f"{self.count} commands in {self.seconds:.1f} s; median / 99 % / most: jitter "
+            f"{words(self.jitter)} ms, while an aligner is at work "
+            f"{words(self.jitter_inferring)} ms, latency {words(self.latency)} ms; watchdog missed "
+            f"{self.missed} times"
         )
 
 
-def timing_of(arrivals: np.ndarray, stamps: np.ndarray, *, clock: RehearsalClock,
-              period: float) -> Timing:  # fmt: skip
+def timing_of(
+    arrivals: np.ndarray,
+    stamps: np.ndarray,
+    *,
+    clock: RehearsalClock,
+    period: float,
+    expiry: float,
+    inferring: Sequence[tuple[float, float]] = (),
+) -> Timing:
     """The timing of commands that arrived at `arrivals` (K,) and were stamped `stamps` (K,), both
-    s on the clock; gaps of ten periods and more are pauses in which nothing is commanded."""
+    s on the clock, as are the beginnings and ends of `inferring`, when an aligner was at work.
+
+    `period` and `expiry` (s): commands are sent each period without a pause, and the driver waits
+    for the next no longer than its expiry.
+    """
+    nothing = (0.0, 0.0, 0.0)
     if len(arrivals) < 2:
-        return Timing(len(arrivals), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    gaps = np.diff(stamps)
-    steady = np.diff(arrivals)[gaps < 10 * period] - period
-    steady = steady if len(steady) else np.zeros(1)
+        return Timing(len(arrivals), 0.0, nothing, nothing, nothing, 0)
+    gaps, late = np.diff(arrivals), arrivals - stamps
+    beside = np.zeros(len(gaps), bool)
+    for begin, end in inferring:
+        beside |= (arrivals[1:] >= begin) & (arrivals[1:] <= end)
     scale = 1000.0 / clock.rate
+    jitter = scale * np.abs(gaps - period)
     return Timing(
-        len(arrivals), _quantiles(scale * np.abs(steady)), _quantiles(scale * (arrivals - stamps))
+        count=len(arrivals),
+        seconds=float(arrivals[-1] - arrivals[0]),
+        jitter=_quantiles(jitter),
+        jitter_inferring=_quantiles(jitter[beside]) if beside.any() else nothing,
+        latency=_quantiles(scale * late),
+        missed=int((gaps > expiry).sum() + (np.abs(late) > expiry).sum()),
     )
 
 
@@ -412,8 +455,9 @@ class RehearsalResult:
     measures: Mapping[str, float]
     timing: Timing
     rate: float
-    # True poses (4, 4) of the scene's objects at the end.
+    # True poses (4, 4) of the scene's objects and of the end effector at the end.
     X_WO: Mapping[str, np.ndarray]
+    X_WE: np.ndarray
 
     def row(self) -> dict[str, Any]:
         """The result as plain JSON values."""
@@ -421,10 +465,9 @@ class RehearsalResult:
             **self.result.row(),
             "measures": {name: float(value) for name, value in self.measures.items()},
             "rate": self.rate,
-            "commands": self.timing.count,
-            "jitter_ms": list(self.timing.jitter),
-            "latency_ms": list(self.timing.latency),
+            **self.timing.row(),
             "X_WO": {name: X.tolist() for name, X in self.X_WO.items()},
+            "X_WE": self.X_WE.tolist(),
         }
 
     def __str__(self) -> str:
@@ -441,11 +484,13 @@ def rehearse(
     record: LogRequest | None = None,
     on_event: Callable[[str], None] | None = None,
     proceed: Callable[[], bool] | None = None,
+    on_log: Callable[[EpisodeLogWriter], None] | None = None,
 ) -> RehearsalResult:
     """Runs one episode on a cell of processes, through LCM, at `rate`.
 
     Boot checks, calibration files, hardware station, supervisor, policy and aligner are those of
-    the real arm. The aligner may be "expert". `on_event` and `proceed` are `ArmEpisode.run`'s.
+    the real arm. The aligner may be "expert". `on_event` and `proceed` are `ArmEpisode.run`'s,
+    `on_log` is called with the log once it is whole.
 
     Raises `RehearsalError`, and what `ArmEpisode` raises.
     """
@@ -497,6 +542,7 @@ def rehearse(
             record=record,
         ) as episode:
             result = episode.run(on_event, proceed=proceed, after_done=AFTER_DONE)
+            begin = clock.now() - episode.time
             snapshots = cell.ask("arm", "snapshots")
             scene = with_distractors(
                 task.scene(seed + scenario.seeds.scene, split),
@@ -512,12 +558,27 @@ def rehearse(
                     result, success=verdict.success, reason=verdict.reason, cause=cause
                 )
             episode.note(result)
+        if on_log and episode.log:
+            on_log(episode.log)
         noted = cell.ask("monitor", "commands")
-    period = scenario.control.period
+    inferring = [
+        (begin + entry.time, begin + after.time)
+        for entry, after in itertools.pairwise(result.timeline)
+        if entry.phase is Phase.INFER
+    ]
+    timing = timing_of(
+        noted[:, 0],
+        noted[:, 1],
+        clock=clock,
+        period=scenario.control.period,
+        expiry=driver.expiry,
+        inferring=inferring,
+    )
     return RehearsalResult(
         result=result,
         measures=measures,
-        timing=timing_of(noted[:, 0], noted[:, 1], clock=clock, period=period),
+        timing=timing,
         rate=rate,
         X_WO={name: X.GetAsMatrix4() for name, X in snapshots[-1].X_WO.items()},
+        X_WE=snapshots[-1].X_WE.GetAsMatrix4(),
     )

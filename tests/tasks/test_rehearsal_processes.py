@@ -37,14 +37,33 @@ def test_a_cell_of_processes_is_booted_seen_and_commanded():
 
 def test_timing_is_in_milliseconds_of_the_wall_clock():
     clock = RehearsalClock(0.0, 0.5)
-    # Every 5 ms, one 2 ms late; then a pause, and two more.
-    stamps = np.array([0.0, 0.005, 0.010, 0.015, 1.0, 1.005])
+    # Every 5 ms, one 2 ms late.
+    stamps = np.array([0.0, 0.005, 0.010, 0.015, 0.020, 0.025])
     arrivals = stamps + [0.001, 0.001, 0.003, 0.001, 0.001, 0.001]
-    timing = timing_of(arrivals, stamps, clock=clock, period=0.005)
-    assert timing.count == 6
+    timing = timing_of(
+        arrivals, stamps, clock=clock, period=0.005, expiry=0.05, inferring=[(0.018, 0.030)]
+    )
+    assert timing.count == 6 and timing.seconds == pytest.approx(0.025) and timing.missed == 0
     assert timing.jitter[2] == pytest.approx(4.0)  # 2 ms of a clock at half the pace
+    assert timing.jitter_inferring == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
     assert timing.latency[0] == pytest.approx(2.0) and timing.latency[2] == pytest.approx(6.0)
-    assert timing_of(np.zeros(0), np.zeros(0), clock=clock, period=0.005).count == 0
+    empty = timing_of(np.zeros(0), np.zeros(0), clock=clock, period=0.005, expiry=0.05)
+    assert empty.count == 0
+
+
+def test_a_stall_and_an_expired_command_are_missed_watchdogs():
+    stamps = 0.005 * np.arange(40.0)
+    clock = RehearsalClock(0.0, 1.0)
+
+    def missed(stamps: np.ndarray, arrivals: np.ndarray) -> int:
+        return timing_of(arrivals, stamps, clock=clock, period=0.005, expiry=0.05).missed
+
+    assert missed(stamps, stamps + 0.049) == 0
+    stalled = stamps + np.where(np.arange(40) < 20, 0.0, 0.06)
+    assert missed(stalled, stalled) == 1
+    late = stamps + 0.001
+    late[39] += 0.051
+    assert missed(stamps, late) == 2  # nothing came for so long, and then one that had expired
 
 
 def test_a_rate_above_the_clocks_is_refused(capsys: pytest.CaptureFixture):
