@@ -49,6 +49,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "machine is too slow); default: in this process, on simulated time, so that it can be "
         "repeated exactly",
     )  # fmt: skip
+    parser.add_argument(
+        "--driver", action="store_true",
+        help="with --realtime: let the simulated arm speak the robot's own protocol, with the "
+        "driver's process of `iga drive panda` between it and LCM (needs the extra `franka`)",
+    )  # fmt: skip
     add_record_arguments(parser)
     add_result_argument(parser)
 
@@ -64,6 +69,8 @@ def run(arguments: argparse.Namespace) -> int:
     scenario = scenario_of(arguments)
     name = arguments.aligner or scenario.aligner.name
     scenario = with_aligner(scenario, name, aligner_options(arguments, [name])[name])
+    if arguments.driver and rate is None:
+        raise CommandError("--driver: it keeps the clock's pace; give a rate, --realtime 1")
     if arguments.count < 1:
         raise CommandError(f"--count {arguments.count}: at least 1 is needed")
     for option in ("record", "result"):
@@ -81,6 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
             split=arguments.split,
             rate=rate,
             in_process=arguments.compare,
+            driver=arguments.driver,
             store=ResultsStore(arguments.results) if arguments.results else None,
             record=log_request(arguments),
             on_event=lambda line: print(line, flush=True),

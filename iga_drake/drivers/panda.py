@@ -22,6 +22,7 @@ from iga_drake.systems.ports import PANDA_JOINTS, ArmMode
 
 _HAND_PERIOD = 0.1  # s
 _HAND_SAME = 1e-4  # m
+_HELD = 0.002  # m: fingers that stop so far from where they were sent hold something
 _RECOVERY = 1.0  # s between two attempts
 
 
@@ -189,8 +190,9 @@ class PandaBridge:
 class HandBridge:
     """Passes the hand's commands on, and its opening back, one step at a time.
 
-    A command that opens is a move, one that closes a grasp. What is commanded again is not done
-    again; a new command ends the motion under way.
+    A command is a move; where it closes and something is in the way, a grasp follows, which presses
+    with the force commanded (a grasp alone would close all the way where nothing is). What is
+    commanded again is not done again; a new command ends the motion under way.
     """
 
     def __init__(
@@ -206,6 +208,7 @@ class HandBridge:
         self._command: lcmt_schunk_wsg_command | None = None
         self._last: float | None = None
         self._motion: threading.Thread | None = None
+        self._ended = threading.Event()  # set where the motion is to end
         lcm.Subscribe(messages.HAND_COMMAND_CHANNEL, self._receive)
 
     def _receive(self, data: bytes) -> None:
@@ -227,15 +230,21 @@ class HandBridge:
 
     def _begin(self, target: float, opening: float, force: float) -> None:
         if self._motion is not None and self._motion.is_alive():
+            self._ended.set()
             self._hand.stop()
             self._motion.join()
         self._last = target
+        self._ended = ended = threading.Event()
 
         def move() -> None:
             try:
+                self._hand.move(target)
+            except DriverError as error:
                 if target > opening:
-                    self._hand.move(target)
-                else:
+                    self._log(f"hand: {error_text(error)}")
+            try:
+                blocked = self._hand.opening() > target + _HELD
+                if target <= opening and blocked and not ended.is_set():
                     self._hand.grasp(target, force)
             except DriverError as error:
                 self._log(f"hand: {error_text(error)}")

@@ -106,6 +106,7 @@ def rehearse_seeds(
     split: Split,
     rate: float | None = None,
     in_process: bool = False,
+    driver: bool = False,
     store: ResultsStore | None = None,
     record: LogRequest | None = None,
     on_event: OnEvent = print,
@@ -114,8 +115,9 @@ def rehearse_seeds(
     """Rehearses each seed: the rows of the results and, where each is also to run `in_process`, on
     the simulated station alone, the comparisons.
 
-    `rate` (None: in one process, on simulated time) is `rehearse`'s. What `store` holds is taken
-    from there, the rest is kept in it. `on_log` is called with each log once it is whole.
+    `rate` (None: in one process, on simulated time) and `driver` are `rehearse`'s. What `store`
+    holds is taken from there, the rest is kept in it. `on_log` is called with each log once it is
+    whole.
 
     Raises what `Episode` and `rehearse` raise.
     """
@@ -143,7 +145,7 @@ def rehearse_seeds(
                 )  # fmt: skip
             done = rehearse(
                 scenario, seed=seed, split=split, rate=rate, record=record, on_event=on_event,
-                on_log=on_log,
+                on_log=on_log, driver=driver,
             )  # fmt: skip
             on_event(str(done))
             return done.row()
@@ -152,6 +154,7 @@ def rehearse_seeds(
             return run_on_station(scenario, "simulated", seed=seed, split=split)
 
         kind = "rehearsal" if rate is None else f"rehearsal at rate {rate:g}"
+        kind += " with a driver" if driver else ""
         rows.append(kept(kind, seed, rehearsed))
         if in_process:
             comparisons.append(compare_rehearsal(kept("in process", seed, alone), rows[-1]))

@@ -1,9 +1,10 @@
 """A rehearsal in real time: the arm's program on one side of LCM, a simulated cell on the other.
 
-The cell is three processes, as the real one is several machines: the arm with whatever lies before
-it, the cameras, and a monitor that notes when commands pass. Their clock is this machine's, or, at
-a rate below 1, one that runs slower by that rate, so that a machine that is too slow for the real
-pace can rehearse everything else: all limits are in seconds of that clock.
+The cell is several processes, as the real one is several machines: the arm with whatever lies
+before it, the cameras, and a monitor that notes when commands pass; where the arm speaks the
+robot's own protocol, its servers and `iga drive panda`'s driver besides. Their clock is this
+machine's, or, at a rate below 1, one that runs slower by that rate, so that a machine that is too
+slow for the real pace can rehearse everything else: all limits are in seconds of that clock.
 """
 
 import contextlib
@@ -13,6 +14,7 @@ import multiprocessing
 import os
 import signal
 import tempfile
+import threading
 import time as wall
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,6 +32,8 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.lcm import LcmBuses, LcmInterfaceSystem
 
 from iga_drake.aligners.registry import EXPERT, ORACLE
+from iga_drake.drivers.franka_rs import FrankaRsArm, FrankaRsHand, connect_franka
+from iga_drake.drivers.panda import HandBridge, PandaBridge
 from iga_drake.errors import IgaDrakeError, error_text
 from iga_drake.policy.inference import Inference
 from iga_drake.policy.motion import Phase
@@ -42,10 +46,13 @@ from iga_drake.station.lcm import check_receive_buffer, decoded, udp_url, utime_
 from iga_drake.station.log.writer import EpisodeLogWriter
 from iga_drake.station.panda import messages
 from iga_drake.station.panda.driver import connect_server
+from iga_drake.station.panda.fci import FciArm, FciHand
+from iga_drake.station.panda.fci_port import FciPort, SharedFciPlant
 from iga_drake.station.panda.messages import ControlMode
 from iga_drake.station.panda.model import find_panda
 from iga_drake.station.panda.server import PandaServer, add_panda_server
 from iga_drake.station.scenario import Scenario, load_scenario
+from iga_drake.station.simulated.scene import Scene
 from iga_drake.station.simulated.station import build_simulation_station
 from iga_drake.systems.messages import Cause
 from iga_drake.tasks.arm_episode import ArmEpisode, ArmResult
@@ -66,6 +73,8 @@ _STATE_PERIOD = 1.0 / 30.0  # s
 _SLICE = 0.01  # s between two looks at what the cell is asked for
 _START_LIMIT = 300.0  # s (wall clock) for the cell's processes to be built
 _ANSWER_LIMIT = 60.0  # s (wall clock)
+# Share of the arm's limits at which the driver's library follows: above those of the commands.
+_DRIVER_SPEED = 0.6
 _NICENESS = 10  # of the cameras: the arm comes first
 
 
@@ -98,6 +107,8 @@ class CellRequest:
     split: Split
     url: str
     clock: RehearsalClock
+    # Whether the arm speaks the robot's own protocol, with a driver's process before it.
+    driver: bool = False
 
     def read(self) -> Scenario:
         """The scenario, for the simulated station."""
@@ -211,8 +222,11 @@ def _cell(request: CellRequest, scenario: Scenario, scene: Any) -> Any:
     return cell
 
 
-def run_arm(connection: Connection, request: CellRequest) -> None:
-    """The process of the arm: physics and the arm's server, until the pipe is closed.
+def run_arm(
+    connection: Connection, request: CellRequest, plant: SharedFciPlant | None = None
+) -> None:
+    """The process of the arm: physics and the arm's server, until the pipe is closed. With `plant`
+    its server is another process.
 
     It answers through the pipe: "expert" with the expert's present poses, "state" with the present
     snapshot, "snapshots" with all.
@@ -226,14 +240,18 @@ def run_arm(connection: Connection, request: CellRequest) -> None:
         builder = DiagramBuilder()
         cell = builder.AddSystem(_cell(request, scenario, scene))
         builder.AddSystem(LcmInterfaceSystem(lcm))
-        server = PandaServer(
-            lcm,
-            control_mode=cast(ControlMode, driver.control_mode),
-            expiry=driver.expiry,
-            opening=0.0 if scene.truth.X_EO else scene.hand_opening,
-            clock=clock,
-        )
-        add_panda_server(builder, server, lcm)
+        server: PandaServer | FciPort
+        if plant is None:
+            server = PandaServer(
+                lcm,
+                control_mode=cast(ControlMode, driver.control_mode),
+                expiry=driver.expiry,
+                opening=_first_opening(scene),
+                clock=clock,
+            )
+            add_panda_server(builder, server, lcm)
+        else:
+            server = builder.AddSystem(FciPort(plant))
         ports = {
             port.get_name(): port
             for port in (
@@ -275,6 +293,55 @@ def run_arm(connection: Connection, request: CellRequest) -> None:
                     connection.send(("ready", snapshot()))
                 else:
                     connection.send(("ready", snapshots))
+
+
+def _first_opening(scene: Scene) -> float:
+    """What the hand was told before the first command (m): what it holds was grasped before."""
+    return 0.0 if scene.truth.X_EO else scene.hand_opening
+
+
+def run_robot(connection: Connection, request: CellRequest, plant: SharedFciPlant) -> None:
+    """The process of the robot's own servers, arm and hand, until the pipe is closed."""
+    _begin_process()
+    with _told(connection):
+        arm = FciArm(plant, rate=request.clock.rate)
+        hand = FciHand(plant, rate=request.clock.rate)
+        connection.send(("ready", None))
+        try:
+            while not connection.poll(1.0):
+                pass
+        finally:
+            arm.close()
+            hand.close()
+
+
+def run_driver(connection: Connection, request: CellRequest) -> None:
+    """The process of the arm's driver, as `iga drive panda` is one, until the pipe is closed."""
+    _begin_process()
+    os.environ["FRANKA_REALTIME"] = "ignore"  # no kernel of a rehearsal is a real-time one
+    with _told(connection):
+        clock, rate = request.clock.now, request.clock.rate
+        robot = connect_franka("127.0.0.1")
+        arm = FrankaRsArm(robot, speed=_DRIVER_SPEED)
+        hand = HandBridge(FrankaRsHand(robot, home=False), DrakeLcm(request.url), clock=clock)
+        bridge = PandaBridge(arm, DrakeLcm(request.url), clock=clock)
+        arm.start()
+        ended = threading.Event()
+
+        def drive_hand() -> None:
+            with _told(connection):
+                while not ended.is_set():
+                    hand.step(round(100 / rate))
+
+        beside = threading.Thread(target=drive_hand, daemon=True)
+        beside.start()
+        connection.send(("ready", None))
+        try:
+            while not connection.poll():
+                bridge.step(round(2 / rate))
+        finally:
+            ended.set()
+            arm.stop()
 
 
 def _publish_state(lcm: DrakeLcm, q: np.ndarray, now: float) -> None:
@@ -383,29 +450,40 @@ class RehearsedCell:
 
     def __init__(self, request: CellRequest, *, image_period: float) -> None:
         """Starts the processes and waits until all are built. Raises `RehearsalError`."""
-        context = multiprocessing.get_context("spawn")
+        self._context = multiprocessing.get_context("spawn")
         self._processes: dict[str, BaseProcess] = {}
         self._connections: dict[str, Connection] = {}
-        for name, target, arguments in (
-            ("arm", run_arm, (request,)),
-            ("cameras", run_cameras, (request, image_period)),
-            ("monitor", run_monitor, (request.url, request.clock)),
-        ):
-            mine, theirs = context.Pipe()
-            process = context.Process(
-                target=target, args=(theirs, *arguments), name=f"rehearsed {name}", daemon=True
+        plant: SharedFciPlant | None = None
+        if request.driver:
+            scene = _scene_of(request, request.read())
+            plant = SharedFciPlant(
+                self._context, position=scene.panda_position, opening=_first_opening(scene)
             )
-            process.start()
-            theirs.close()
-            self._processes[name], self._connections[name] = process, mine
         try:
+            self._start("arm", run_arm, request, plant)
+            self._start("cameras", run_cameras, request, image_period)
+            self._start("monitor", run_monitor, request.url, request.clock)
             self._receive("arm", _START_LIMIT)
             # Camera -> X_WC (4, 4) as a calibration would have found it, error included.
             self.poses: Mapping[str, np.ndarray] = self._receive("cameras", _START_LIMIT)
             self._receive("monitor", _START_LIMIT)
+            if plant is not None:
+                self._start("robot", run_robot, request, plant)
+                self._receive("robot", _START_LIMIT)
+                self._start("driver", run_driver, request)
+                self._receive("driver", _START_LIMIT)
         except BaseException:
             self.close()
             raise
+
+    def _start(self, name: str, target: Callable[..., None], *arguments: Any) -> None:
+        mine, theirs = self._context.Pipe()
+        process = self._context.Process(
+            target=target, args=(theirs, *arguments), name=f"rehearsed {name}", daemon=True
+        )
+        process.start()
+        theirs.close()
+        self._processes[name], self._connections[name] = process, mine
 
     def _receive(self, name: str, limit: float) -> Any:
         connection = self._connections[name]
@@ -431,10 +509,10 @@ class RehearsedCell:
         return self._receive(name, _ANSWER_LIMIT)
 
     def close(self) -> None:
-        """Ends the processes."""
-        for connection in self._connections.values():
-            connection.close()
-        for process in self._processes.values():
+        """Ends the processes, the driver's first, which lets go of the arm."""
+        for name in reversed(self._processes):
+            self._connections[name].close()
+            process = self._processes[name]
             process.join(2.0)
             if process.is_alive():
                 process.kill()
@@ -485,12 +563,14 @@ def rehearse(
     on_event: Callable[[str], None] | None = None,
     proceed: Callable[[], bool] | None = None,
     on_log: Callable[[EpisodeLogWriter], None] | None = None,
+    driver: bool = False,
 ) -> RehearsalResult:
     """Runs one episode on a cell of processes, through LCM, at `rate`.
 
     Boot checks, calibration files, hardware station, supervisor, policy and aligner are those of
     the real arm. The aligner may be "expert". `on_event` and `proceed` are `ArmEpisode.run`'s,
-    `on_log` is called with the log once it is whole.
+    `on_log` is called with the log once it is whole. With `driver` the arm speaks the robot's own
+    protocol, and a driver's process, with the library of a real arm, is between it and LCM.
 
     Raises `RehearsalError`, and what `ArmEpisode` raises.
     """
@@ -503,8 +583,12 @@ def rehearse(
     check_receive_buffer(url)
     clock = RehearsalClock(wall.time(), rate)
     scenario = replace(scenario, lcm_buses={"default": DrakeLcmParams(lcm_url=url)})
-    driver = replace(scenario.model_drivers["panda"], lcm_bus="default")
-    request = CellRequest(scenario.to_yaml(), seed, split, url, clock)
+    panda = replace(scenario.model_drivers["panda"], lcm_bus="default")
+    if driver and panda.control_mode != "position":
+        raise RehearsalError(
+            f"control mode {panda.control_mode}: this package's driver is for position"
+        )
+    request = CellRequest(scenario.to_yaml(), seed, split, url, clock, driver)
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         cell = stack.enter_context(RehearsedCell(request, image_period=image_period))
@@ -522,11 +606,11 @@ def rehearse(
         scenario = replace(
             scenario,
             station="hardware",
-            model_drivers={"panda": driver},
+            model_drivers={"panda": panda},
             hardware=replace(scenario.hardware, camera_bus="default", calibration=str(folder)),
         )
         start = boot_panda(
-            DrakeLcm(url), driver, limit=scenario.hardware.boot_limit / rate, clock=clock.now
+            DrakeLcm(url), panda, limit=scenario.hardware.boot_limit / rate, clock=clock.now
         )
         inference: Inference | None = None
         if scenario.aligner.name == EXPERT:
@@ -571,7 +655,7 @@ def rehearse(
         noted[:, 1],
         clock=clock,
         period=scenario.control.period,
-        expiry=driver.expiry,
+        expiry=panda.expiry,
         inferring=inferring,
     )
     return RehearsalResult(

@@ -239,6 +239,8 @@ class SlowHand:
 
     def move(self, opening: float) -> None:
         self.did.append(("move", opening))
+        if opening < self.width:  # there is something in the way
+            raise DriverError("not reached")
         for _ in range(200):
             if self.stopped:
                 return
@@ -263,7 +265,7 @@ def test_the_hand_moves_grasps_and_is_told_once():
         lcm.Publish(messages.HAND_COMMAND_CHANNEL, b"foreign")
         bridge.step(0)
     bridge._motion.join()
-    assert hand.did == [("move", 0.08), ("grasp", 0.0, 15.0)]
+    assert hand.did == [("move", 0.08), ("move", 0.0), ("grasp", 0.0, 15.0)]
     assert hand.stopped and said == ["hand: nothing between the fingers"]
     lcm.HandleSubscriptions(0)
     status = lcmt_schunk_wsg_status.decode(statuses[-1])
@@ -280,3 +282,20 @@ def test_options_are_checked_before_anything_moves(capsys):
     for option, value in (("--speed", "3"), ("--lcm-url", "memq://"), ("--step", "9")):
         assert cli.main(["drive", "panda", "--ip", "127.0.0.1", option, value]) == cli.BAD_INPUT
         assert option.lstrip("-").replace("-", "_") in capsys.readouterr().err.replace("-", "_")
+
+
+def test_a_hand_that_closes_to_a_width_is_not_told_to_grasp():
+    lcm, hand = DrakeLcm("memq://"), SlowHand()
+    hand.width, hand.stopped = 0.08, True
+
+    def move(opening: float) -> None:
+        hand.did.append(("move", opening))
+        hand.width = opening
+
+    hand.move = move
+    bridge = HandBridge(hand, lcm, clock=lambda: NOW)
+    command = messages.hand_command(0.05, force=15.0, utime=utime_of(NOW))
+    lcm.Publish(messages.HAND_COMMAND_CHANNEL, command.encode())
+    bridge.step(0)
+    bridge._motion.join()
+    assert hand.did == [("move", 0.05)]

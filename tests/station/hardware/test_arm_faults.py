@@ -63,7 +63,7 @@ class Robot:
         scenario.supervisor.grip_margin = 0.003
         scenario.policy.observe_settle = LOOK
         scenario.policy.observe_limit = 0.04
-        scenario.fusion.maximum_age = 0.12
+        scenario.fusion.maximum_age, scenario.fusion.minimum_valid = 0.12, 0.001
         self.scenario = scenario
         self.late = 0.0  # s, by which the diagram lags behind the clock
 
