@@ -46,7 +46,7 @@ from iga_drake.station.lcm import check_receive_buffer, decoded, udp_url, utime_
 from iga_drake.station.log.writer import EpisodeLogWriter
 from iga_drake.station.panda import messages
 from iga_drake.station.panda.driver import connect_server
-from iga_drake.station.panda.fci import FciArm, FciHand
+from iga_drake.station.panda.fci import FciArm, FciHand, loopback_address
 from iga_drake.station.panda.fci_port import FciPort, SharedFciPlant
 from iga_drake.station.panda.messages import ControlMode
 from iga_drake.station.panda.model import find_panda
@@ -107,8 +107,9 @@ class CellRequest:
     split: Split
     url: str
     clock: RehearsalClock
-    # Whether the arm speaks the robot's own protocol, with a driver's process before it.
-    driver: bool = False
+    # Where the arm speaks the robot's own protocol, with a driver's process before it; empty: it
+    # speaks LCM itself.
+    robot_address: str = ""
 
     def read(self) -> Scenario:
         """The scenario, for the simulated station."""
@@ -304,8 +305,8 @@ def run_robot(connection: Connection, request: CellRequest, plant: SharedFciPlan
     """The process of the robot's own servers, arm and hand, until the pipe is closed."""
     _begin_process()
     with _told(connection):
-        arm = FciArm(plant, rate=request.clock.rate)
-        hand = FciHand(plant, rate=request.clock.rate)
+        arm = FciArm(plant, address=request.robot_address, rate=request.clock.rate)
+        hand = FciHand(plant, address=request.robot_address, rate=request.clock.rate)
         connection.send(("ready", None))
         try:
             while not connection.poll(1.0):
@@ -321,7 +322,7 @@ def run_driver(connection: Connection, request: CellRequest) -> None:
     os.environ["FRANKA_REALTIME"] = "ignore"  # no kernel of a rehearsal is a real-time one
     with _told(connection):
         clock, rate = request.clock.now, request.clock.rate
-        robot = connect_franka("127.0.0.1")
+        robot = connect_franka(request.robot_address)
         arm = FrankaRsArm(robot, speed=_DRIVER_SPEED)
         hand = HandBridge(FrankaRsHand(robot, home=False), DrakeLcm(request.url), clock=clock)
         bridge = PandaBridge(arm, DrakeLcm(request.url), clock=clock)
@@ -341,7 +342,7 @@ def run_driver(connection: Connection, request: CellRequest) -> None:
                 bridge.step(round(2 / rate))
         finally:
             ended.set()
-            arm.stop()
+            bridge.stop()
 
 
 def _publish_state(lcm: DrakeLcm, q: np.ndarray, now: float) -> None:
@@ -454,7 +455,7 @@ class RehearsedCell:
         self._processes: dict[str, BaseProcess] = {}
         self._connections: dict[str, Connection] = {}
         plant: SharedFciPlant | None = None
-        if request.driver:
+        if request.robot_address:
             scene = _scene_of(request, request.read())
             plant = SharedFciPlant(
                 self._context, position=scene.panda_position, opening=_first_opening(scene)
@@ -588,7 +589,8 @@ def rehearse(
         raise RehearsalError(
             f"control mode {panda.control_mode}: this package's driver is for position"
         )
-    request = CellRequest(scenario.to_yaml(), seed, split, url, clock, driver)
+    address = loopback_address() if driver else ""
+    request = CellRequest(scenario.to_yaml(), seed, split, url, clock, address)
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         cell = stack.enter_context(RehearsedCell(request, image_period=image_period))

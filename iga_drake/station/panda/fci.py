@@ -7,9 +7,11 @@ of libfranka-common (Apache 2.0). What no client of this package asks for is ref
 """
 
 import contextlib
+import os
 import select
 import socket
 import struct
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -29,8 +31,6 @@ _ARM_VERSION, _HAND_VERSION = 5, 3
 _TICK = 0.001  # s
 _HAND_TICK = 0.05  # s between states of the hand
 _BEHIND = 0.05  # s (wall clock) after which lost ticks are given up
-# Ticks without a command while the arm moves, after which it stops in a reflex.
-_SILENCE = 20
 # A command may be so many times as fast as the joints' limit.
 _DISCONTINUITY = 1.2
 _STALL, _STALL_TIME, _WIDTH = 2e-4, 0.3, 1e-3  # m, s, m: when fingers have come to rest
@@ -39,6 +39,14 @@ _DOUBLES = 284  # of a state, between its number and its modes
 _STATE = struct.Struct(f"<Q{_DOUBLES}d2B82?Bd")
 _COMMAND = struct.Struct("<Q38d2?7d")
 _HAND_STATE = struct.Struct("<I2d?H")
+
+
+def loopback_address() -> str:
+    """An address of this machine alone, on Linux one for each process: the ports are fixed."""
+    number = os.getpid()
+    if sys.platform != "linux":
+        return "127.0.0.1"
+    return f"127.{number >> 14 & 127 | 128}.{number >> 7 & 127}.{1 + (number & 127)}"
 
 
 class FciError(IgaDrakeError):
@@ -191,9 +199,18 @@ class FciArm(_Server):
     `mode` play what else may happen to an arm.
     """
 
-    def __init__(self, plant: FciPlant, *, address: str = "127.0.0.1", rate: float = 1.0) -> None:
-        """`rate`: seconds of the robot's clock in one of this machine's. Raises `FciError`."""
-        self._plant = plant
+    def __init__(
+        self,
+        plant: FciPlant,
+        *,
+        address: str = "127.0.0.1",
+        rate: float = 1.0,
+        patience: int = 20,
+    ) -> None:
+        """`rate`: seconds of the robot's clock in one of this machine's; `patience`: ticks (1 ms)
+        without a command, while the arm moves, after which it stops in a reflex. Raises
+        `FciError`."""
+        self._plant, self._patience = plant, patience
         self.mode = FciMode.IDLE
         self._errors = [False] * 41
         self._motion: int | None = None  # number of the command that began it
@@ -248,7 +265,7 @@ class FciArm(_Server):
                 if self._motion is not None:
                     if position is None:
                         silence += 1
-                        if silence > _SILENCE:
+                        if silence > self._patience:
                             self._stop(FciMode.REFLEX, _REFLEX, _COMMUNICATION)
                     else:
                         last, silence = self._follow(position, last, silence), 0

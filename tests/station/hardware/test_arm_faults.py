@@ -439,7 +439,7 @@ def test_the_next_episode_runs(moving: Robot):
 
 
 def test_an_inverted_calibration_is_refused(tmp_path: Path):
-    scenario = hardware_scenario(tmp_path, WIDE)
+    scenario = hardware_scenario(tmp_path, None)
     calibration = calibration_of(scenario, "left")
     X_CW = calibration.X_WC.inverse()
     pose = Pose(list(X_CW.translation()), list(RollPitchYaw(X_CW.rotation()).vector()))
