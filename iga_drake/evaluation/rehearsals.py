@@ -13,7 +13,7 @@ from iga_drake.evaluation.task_success import trial_key
 from iga_drake.station.log.writer import EpisodeLogWriter
 from iga_drake.station.scenario import Scenario
 from iga_drake.tasks.episode import Episode, LogRequest
-from iga_drake.tasks.rehearsal import rehearse
+from iga_drake.tasks.rehearsal import poses_of, rehearse
 from iga_drake.tasks.task import Split
 
 OnEvent = Callable[[str], None]
@@ -32,7 +32,7 @@ def run_on_station(
 ) -> dict[str, Any]:
     """One episode in this process on simulated time, with `station` in place of the scenario's
     ("simulated", or "rehearsal" with LCM in between): the result's row, with the true poses (4, 4)
-    of objects, "X_WO", and end effector, "X_WE", at the end."""
+    of the objects with a role, "X_WO", and of the end effector, "X_WE", at the end."""
     policy = dataclasses.replace(scenario.policy, inference="lockstep")
     scenario = dataclasses.replace(scenario, station=station, policy=policy)
     with Episode(scenario, seed=seed, split=split, record=record) as episode:
@@ -40,7 +40,7 @@ def run_on_station(
         last = episode.snapshots[-1]
     if on_log and episode.log:
         on_log(episode.log)
-    row["X_WO"] = {name: X.GetAsMatrix4().tolist() for name, X in last.X_WO.items()}
+    row["X_WO"] = {name: X.tolist() for name, X in poses_of(episode.scene, last).items()}
     row["X_WE"] = last.X_WE.GetAsMatrix4().tolist()
     return row
 

@@ -526,6 +526,16 @@ class RehearsedCell:
         self.close()
 
 
+def poses_of(scene: Scene, snapshot: Snapshot) -> dict[str, np.ndarray]:
+    """Poses X_WO (4, 4) by name of the objects that are grasped or a target: not of marbles and what
+    else lies around."""
+    return {
+        name: X.GetAsMatrix4()
+        for name, X in snapshot.X_WO.items()
+        if any(item.name == name and item.role != "other" for item in scene.objects)
+    }
+
+
 @dataclass(frozen=True)
 class RehearsalResult:
     """The verdict on the true state, and how commands travelled."""
@@ -534,7 +544,7 @@ class RehearsalResult:
     measures: Mapping[str, float]
     timing: Timing
     rate: float
-    # True poses (4, 4) of the scene's objects and of the end effector at the end.
+    # True poses (4, 4) at the end of the objects with a role, and of the end effector.
     X_WO: Mapping[str, np.ndarray]
     X_WE: np.ndarray
 
@@ -665,6 +675,6 @@ def rehearse(
         measures=measures,
         timing=timing,
         rate=rate,
-        X_WO={name: X.GetAsMatrix4() for name, X in snapshots[-1].X_WO.items()},
+        X_WO=poses_of(scene, snapshots[-1]),
         X_WE=snapshots[-1].X_WE.GetAsMatrix4(),
     )
