@@ -527,8 +527,8 @@ class RehearsedCell:
 
 
 def poses_of(scene: Scene, snapshot: Snapshot) -> dict[str, np.ndarray]:
-    """Poses X_WO (4, 4) by name of the objects that are grasped or a target: not of marbles and what
-    else lies around."""
+    """Poses X_WO (4, 4) by name of the objects that are grasped or a target: of no marbles, nor of
+    what else lies around."""
     return {
         name: X.GetAsMatrix4()
         for name, X in snapshot.X_WO.items()
