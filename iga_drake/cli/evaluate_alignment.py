@@ -15,6 +15,7 @@ from iga_drake.cli.status import CommandError
 from iga_drake.errors import kept_on_interrupt
 from iga_drake.evaluation.results import ResultsStore, results_file, results_kept
 from iga_drake.files import output_file, write_text
+from iga_drake.viewing.figures import figure_file
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,6 +76,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--card", type=card, help="write a model card of iga's weights, or of a single peer's"
     )
     parser.add_argument("--energy-card", type=card, help="write one of its energy")
+    markdown = partial(output_file, begins=(b"Mean errors",))
+    parser.add_argument(
+        "--markdown", type=markdown, metavar="FILE", help="write the errors as tables"
+    )
+    parser.add_argument("--png", type=figure_file, metavar="FILE", help="draw the mean errors")
     parser.add_argument("--json", action="store_true", help="print the errors as JSON")
 
 
@@ -89,6 +95,7 @@ def run(arguments: argparse.Namespace) -> None:
         evaluate_alignment,
         own_objects,
     )
+    from iga_drake.evaluation.alignment_reports import draw_errors, markdown_errors
 
     sets, config, asked = arguments.sets or EVALUATION_SETS, CONFIG, arguments.aligner
     mine = arguments.meshes or arguments.relations
@@ -139,6 +146,10 @@ def run(arguments: argparse.Namespace) -> None:
                 print(by_category(rows))
     if arguments.json:
         print(json.dumps([asdict(summary) for summary in summaries], indent=2))
+    if arguments.markdown:
+        write_text(arguments.markdown, markdown_errors(summaries))
+    if arguments.png:
+        draw_errors(summaries, arguments.png)
     _write_cards(arguments, summaries)
 
 
