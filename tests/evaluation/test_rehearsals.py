@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from control_fixtures import panda_robot
 from scipy.spatial.transform import Rotation
 
 from iga_drake import cli
@@ -17,6 +18,7 @@ from iga_drake.evaluation.rehearsals import (
 )
 from iga_drake.evaluation.results import ResultsStore
 from iga_drake.station.scenario import load_scenario
+from iga_drake.tasks.registry import scenario_task
 
 
 def pose(rotvec: Any = (0, 0, 0), translation: Any = (0, 0, 0)) -> np.ndarray:
@@ -111,3 +113,32 @@ def test_options_that_make_no_sense_are_refused(arguments, reason, capsys, tmp_p
     command = ["rehearse", "grasp", "--aligner", "expert", *arguments]
     assert cli.main(command) == cli.BAD_INPUT
     assert reason in capsys.readouterr().err
+
+
+def test_the_same_happens_in_process_and_behind_lcm(tmp_path: Path, capsys):
+    """The beginning of an episode: the hand is on its way when the time is over."""
+    small = "{width: 96, height: 72, fx: 92.4, fy: 92.4, cx: 47.5, cy: 35.5}"
+    overlay = tmp_path / "small.yaml"
+    cameras = "\n".join(f"  camera_{k}: {{intrinsics: {small}}}" for k in range(3))
+    overlay.write_text(f"cameras:\n{cameras}\n", encoding="utf-8")
+    results = tmp_path / "results.jsonl"
+    command = [
+        "rehearse", "grasp", "--aligner", "expert", "--compare", "--with", str(overlay),
+        "--set", "segmentation.source=truth", "--set", "policy.minimum_points=4",
+        "--set", "panda.visuals=primitives", "--set", "task.time_limit=1.2",
+        "--results", str(results),
+    ]  # fmt: skip
+    assert cli.main(command) == cli.SUCCESS  # both fail, for the same reason
+    text = capsys.readouterr().out
+    assert "seed 0: failure in process, failure in the rehearsal" in text
+    rows = {key["kind"]: row for key, row in ResultsStore(results).rows()}
+    alone, rehearsed = rows["in process"], rows["rehearsal"]
+    assert "are over" in alone["reason"] and "are over" in rehearsed["reason"]
+    scene = scenario_task(load_scenario("grasp", "hardware")).scene(0, "test")
+    start = panda_robot().pose(scene.panda_position).GetAsMatrix4()
+    assert pose_distance(start, alone["X_WE"])[0] > 0.02  # it has moved
+    found = compare_rehearsal(alone, rehearsed)
+    assert found.objects[0] < 1e-3
+    assert found.end_effector[0] < 0.02  # some 0.1 s later, at 0.1 m/s
+    assert cli.main(command) == cli.SUCCESS
+    assert capsys.readouterr().out.count("measured before") == 2
