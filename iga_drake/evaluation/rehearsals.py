@@ -33,8 +33,15 @@ def run_on_station(
     """One episode in this process on simulated time, with `station` in place of the scenario's
     ("simulated", or "rehearsal" with LCM in between): the result's row, with the true poses (4, 4)
     of the objects with a role, "X_WO", and of the end effector, "X_WE", at the end."""
-    policy = dataclasses.replace(scenario.policy, inference="lockstep")
-    scenario = dataclasses.replace(scenario, station=station, policy=policy)
+    driver = dataclasses.replace(scenario.model_drivers["panda"], lcm_bus="default")
+    scenario = dataclasses.replace(
+        scenario,
+        station=station,
+        policy=dataclasses.replace(scenario.policy, inference="lockstep"),
+        lcm_buses=Scenario().lcm_buses,
+        model_drivers={"panda": driver},
+        hardware=dataclasses.replace(scenario.hardware, camera_bus="default"),
+    )
     with Episode(scenario, seed=seed, split=split, record=record) as episode:
         row = episode.run(on_event).row()
         last = episode.snapshots[-1]
