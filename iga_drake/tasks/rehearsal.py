@@ -224,9 +224,9 @@ def _cell(request: CellRequest, scenario: Scenario, scene: Any) -> Any:
 
 
 def run_arm(
-    connection: Connection, request: CellRequest, plant: SharedFciPlant | None = None
+    connection: Connection, request: CellRequest, robot: SharedFciPlant | None = None
 ) -> None:
-    """The process of the arm: physics and the arm's server, until the pipe is closed. With `plant`
+    """The process of the arm: physics and the arm's server, until the pipe is closed. With `robot`
     its server is another process.
 
     It answers through the pipe: "expert" with the expert's present poses, "state" with the present
@@ -242,7 +242,7 @@ def run_arm(
         cell = builder.AddSystem(_cell(request, scenario, scene))
         builder.AddSystem(LcmInterfaceSystem(lcm))
         server: PandaServer | FciPort
-        if plant is None:
+        if robot is None:
             server = PandaServer(
                 lcm,
                 control_mode=cast(ControlMode, driver.control_mode),
@@ -252,7 +252,7 @@ def run_arm(
             )
             add_panda_server(builder, server, lcm)
         else:
-            server = builder.AddSystem(FciPort(plant))
+            server = builder.AddSystem(FciPort(robot))
         ports = {
             port.get_name(): port
             for port in (
