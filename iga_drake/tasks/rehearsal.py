@@ -13,6 +13,7 @@ import itertools
 import multiprocessing
 import os
 import signal
+import sys
 import tempfile
 import threading
 import time as wall
@@ -330,9 +331,11 @@ def run_driver(connection: Connection, request: CellRequest) -> None:
         ended = threading.Event()
 
         def drive_hand() -> None:
-            with _told(connection):
+            try:
                 while not ended.is_set():
                     hand.step(round(100 / rate))
+            except IgaDrakeError as error:
+                print(f"the rehearsed hand: {error_text(error)}", file=sys.stderr, flush=True)
 
         beside = threading.Thread(target=drive_hand, daemon=True)
         beside.start()

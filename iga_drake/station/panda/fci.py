@@ -14,7 +14,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Protocol
@@ -29,7 +29,7 @@ from iga_drake.systems.ports import PANDA_JOINTS
 ARM_PORT, HAND_PORT = 1337, 1338
 _ARM_VERSION, _HAND_VERSION = 5, 3
 _TICK = 0.001  # s
-_HAND_TICK = 0.05  # s between states of the hand
+_HAND_TICK = 0.05  # s (wall clock: clients don't wait for long) between states of the hand
 _BEHIND = 0.05  # s (wall clock) after which lost ticks are given up
 # A command may be so many times as fast as the joints' limit.
 _DISCONTINUITY = 1.2
@@ -163,11 +163,11 @@ class _Server:
     def _serve(self, client: socket.socket, states: socket.socket) -> None:
         raise NotImplementedError
 
-    def _ticks(self, tick: float):
-        """Yields once every `tick` (s of the robot's clock), until the server is closed."""
+    def _ticks(self, tick: float) -> Iterator[None]:
+        """Yields once every `tick` (s of the wall clock), until the server is closed."""
         due = time.monotonic()
         while not self._closed.is_set():
-            due += tick / self._rate
+            due += tick
             left = due - time.monotonic()
             if left > 0:
                 time.sleep(left)
@@ -241,7 +241,7 @@ class FciArm(_Server):
     def _serve(self, client: socket.socket, states: socket.socket) -> None:
         connected, number, silence = False, 0, 0
         last: np.ndarray | None = None
-        for _ in self._ticks(_TICK):
+        for _ in self._ticks(_TICK / self._rate):
             while _waiting(client):
                 command, call, size = _HEADER.unpack(_receive(client, _HEADER.size))
                 payload = _receive(client, size - _HEADER.size)
@@ -401,12 +401,12 @@ class FciHand(_Server):
                     motion = _motion(command, call, payload)
                     self._plant.command_hand(motion.goal)
             opening = self._plant.read().opening
-            if motion is not None and motion.ended(opening):
+            if motion is not None and motion.ended(opening, _HAND_TICK * self._rate):
                 good = _SUCCESS if motion.succeeds(opening) else _HAND_UNSUCCESSFUL
                 self._answer(client, motion.command, motion.call, good)
                 motion = None
             if connected:
-                number += round(1000 * _HAND_TICK)
+                number += max(1, round(1000 * _HAND_TICK * self._rate))
                 with contextlib.suppress(ConnectionRefusedError):
                     states.send(_HAND_STATE.pack(number, opening, HAND_OPENING_MAX, False, 30))
 
@@ -426,16 +426,17 @@ class _Motion:
     call: int
     goal: float  # m
     succeeds: Callable[[float], bool]  # with the opening (m) at its end
-    _opening: float = float("nan")
-    _ticks: int = 0
+    _opening: float = float("nan")  # where they were when they last moved
+    _rested: float = 0.0  # s
 
-    def ended(self, opening: float) -> bool:
-        """Whether the fingers, `opening` (m) apart now, have come to rest; asked once a tick."""
-        moved = not abs(opening - self._opening) <= _STALL
-        self._ticks = 0 if moved else self._ticks + 1
-        self._opening = opening
-        rests = self._ticks * _HAND_TICK >= _STALL_TIME
-        return rests or abs(opening - self.goal) <= _WIDTH
+    def ended(self, opening: float, since: float) -> bool:
+        """Whether the fingers, `opening` (m) apart now, have come to rest; `since` (s of the
+        robot's clock): since this was asked last."""
+        if abs(opening - self._opening) <= _STALL:
+            self._rested += since
+        else:
+            self._opening, self._rested = opening, 0.0
+        return self._rested >= _STALL_TIME or abs(opening - self.goal) <= _WIDTH
 
 
 def _motion(command: int, call: int, payload: bytes) -> _Motion:
