@@ -193,7 +193,8 @@ def summary_of(
         seconds = math.fsum(row["command_seconds"] for row in timed)
         lines.append(
             f"{sum(row['commands'] for row in timed)} commands in {seconds:.0f} s, watchdog missed "
-            f"{sum(row['missed'] for row in timed)} times"
+            f"{sum(row['missed'] for row in timed)} times, "
+            f"{sum(row['missed_moving'] for row in timed)} of them while commands changed"
         )
         for what, name in (
             ("jitter", "jitter_ms"),

@@ -142,9 +142,10 @@ class Timing:
     jitter_inferring: tuple[float, float, float]
     # From a command's stamp to its arrival.
     latency: tuple[float, float, float]
-    # How often a driver's watchdog would have run out: no command for `expiry`, or one that was
-    # older than that when it came.
+    # How often a driver's watchdog would have run out, no command for `expiry` or one that was older
+    # than that when it came: in all, and while commands changed.
     missed: int
+    missed_moving: int
 
     def row(self) -> dict[str, Any]:
         """The timing as plain JSON values."""
@@ -155,6 +156,7 @@ class Timing:
             "jitter_inferring_ms": list(self.jitter_inferring),
             "latency_ms": list(self.latency),
             "missed": self.missed,
+            "missed_moving": self.missed_moving,
         }
 
     def __str__(self) -> str:
@@ -165,7 +167,7 @@ class Timing:
             f"{self.count} commands in {self.seconds:.1f} s; median / 99 % / most: jitter "
             f"{words(self.jitter)} ms, while an aligner is at work "
             f"{words(self.jitter_inferring)} ms, latency {words(self.latency)} ms; watchdog missed "
-            f"{self.missed} times"
+            f"{self.missed} times, {self.missed_moving} of them while commands changed"
         )
 
 
@@ -176,30 +178,38 @@ def timing_of(
     clock: RehearsalClock,
     period: float,
     expiry: float,
+    changes: np.ndarray | None = None,
     inferring: Sequence[tuple[float, float]] = (),
 ) -> Timing:
     """The timing of commands that arrived at `arrivals` (K,) and were stamped `stamps` (K,), both
     s on the clock, as are the beginnings and ends of `inferring`, when an aligner was at work.
 
     `period` and `expiry` (s): commands are sent each period without a pause, and the driver waits
-    for the next no longer than its expiry.
+    for the next no longer than its expiry. `changes` (K,): which commands differ from the one
+    before; None: all.
     """
     nothing = (0.0, 0.0, 0.0)
     if len(arrivals) < 2:
-        return Timing(len(arrivals), 0.0, nothing, nothing, nothing, 0)
+        return Timing(len(arrivals), 0.0, nothing, nothing, nothing, 0, 0)
     gaps, late = np.diff(arrivals), arrivals - stamps
     beside = np.zeros(len(gaps), bool)
     for begin, end in inferring:
         beside |= (arrivals[1:] >= begin) & (arrivals[1:] <= end)
     scale = 1000.0 / clock.rate
     jitter = scale * np.abs(gaps - period)
+    changes = np.ones(len(arrivals), bool) if changes is None else changes.astype(bool)
+    # A gap lies in a motion where the command before it or that after it differs.
+    moving = changes | np.append(changes[1:], False)
+    silent, old = np.flatnonzero(gaps > expiry), np.flatnonzero(np.abs(late) > expiry)
+    in_motion = (changes[silent] | changes[silent + 1]).sum() + moving[old].sum()
     return Timing(
         count=len(arrivals),
         seconds=float(arrivals[-1] - arrivals[0]),
         jitter=_quantiles(jitter),
         jitter_inferring=_quantiles(jitter[beside]) if beside.any() else nothing,
         latency=_quantiles(scale * late),
-        missed=int((gaps > expiry).sum() + (np.abs(late) > expiry).sum()),
+        missed=len(silent) + len(old),
+        missed_moving=int(in_motion),
     )
 
 
@@ -406,18 +416,21 @@ def run_cameras(connection: Connection, request: CellRequest, period: float) -> 
 
 
 def run_monitor(connection: Connection, url: str, clock: RehearsalClock) -> None:
-    """The process that notes when commands arrive and what they are stamped with (s on the clock),
-    and tells it when it is asked."""
+    """The process that notes when commands arrive, what they are stamped with (s on the clock) and
+    whether they differ from the one before, and tells it when it is asked."""
     _begin_process()
     with _told(connection):
         lcm = DrakeLcm(url)
-        noted: list[tuple[float, float]] = []
+        noted: list[tuple[float, float, bool]] = []
+        last: list[tuple[Any, Any]] = []
 
         def receive(data: bytes) -> None:
             now = clock.now()
             message = decoded(lcmt_panda_command, data)
             if message is not None:
-                noted.append((now, 1e-6 * message.utime))
+                values = message.joint_position, message.joint_velocity
+                noted.append((now, 1e-6 * message.utime, last != [values]))
+                last[:] = [values]
 
         lcm.Subscribe(messages.COMMAND_CHANNEL, receive)
         connection.send(("ready", None))
@@ -425,7 +438,7 @@ def run_monitor(connection: Connection, url: str, clock: RehearsalClock) -> None
             lcm.HandleSubscriptions(20)
             if connection.poll():
                 connection.recv()
-                connection.send(("ready", np.array(noted).reshape(-1, 2)))
+                connection.send(("ready", np.array(noted, float).reshape(-1, 3)))
 
 
 def _begin_process(niceness: int = 0) -> None:
@@ -671,6 +684,7 @@ def rehearse(
         clock=clock,
         period=scenario.control.period,
         expiry=panda.expiry,
+        changes=noted[:, 2],
         inferring=inferring,
     )
     return RehearsalResult(

@@ -59,7 +59,7 @@ def test_the_object_that_is_furthest_counts():
 
 def test_the_summary_counts_and_takes_the_median():
     timing = {
-        "commands": 2000, "command_seconds": 10.0, "missed": 1, "jitter_ms": [0.1, 1.0, 9.0],
+        "commands": 2000, "command_seconds": 10.0, "missed": 1, "missed_moving": 0, "jitter_ms": [0.1, 1.0, 9.0],
         "jitter_inferring_ms": [0.1, 2.0, 4.0], "latency_ms": [0.2, 0.5, 3.0],
     }  # fmt: skip
     shifts = (0.001, 0.002, 0.009)
@@ -69,7 +69,7 @@ def test_the_summary_counts_and_takes_the_median():
     assert "2 of 3 rehearsals succeeded" in text and "seed 2: dropped" in text
     assert "2 of 3 with the same verdict" in text
     assert "objects apart: median 2.00 mm 0.00 deg, most 9.00 mm" in text
-    assert "6000 commands in 30 s, watchdog missed 3 times" in text
+    assert "6000 commands in 30 s, watchdog missed 3 times, 0 of them while" in text
     assert "while an aligner is at work: 99 % under 2.00 ms" in text
 
 

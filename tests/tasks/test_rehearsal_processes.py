@@ -55,15 +55,24 @@ def test_a_stall_and_an_expired_command_are_missed_watchdogs():
     stamps = 0.005 * np.arange(40.0)
     clock = RehearsalClock(0.0, 1.0)
 
-    def missed(stamps: np.ndarray, arrivals: np.ndarray) -> int:
-        return timing_of(arrivals, stamps, clock=clock, period=0.005, expiry=0.05).missed
+    def missed(stamps: np.ndarray, arrivals: np.ndarray, changes: slice) -> tuple[int, int]:
+        differs = np.zeros(40)
+        differs[changes] = 1
+        timing = timing_of(
+            arrivals, stamps, clock=clock, period=0.005, expiry=0.05, changes=differs
+        )
+        return timing.missed, timing.missed_moving
 
-    assert missed(stamps, stamps + 0.049) == 0
+    assert missed(stamps, stamps + 0.049, slice(None)) == (0, 0)
     stalled = stamps + np.where(np.arange(40) < 20, 0.0, 0.06)
-    assert missed(stalled, stalled) == 1
+    assert missed(stalled, stalled, slice(20, 40)) == (1, 1)
+    assert missed(stalled, stalled, slice(0, 20)) == (1, 1)
+    assert missed(stalled, stalled, slice(0, 19)) == (1, 0)  # it stood still before and after
     late = stamps + 0.001
     late[39] += 0.051
-    assert missed(stamps, late) == 2  # nothing came for so long, and then one that had expired
+    # Nothing came for so long, and then one that had expired.
+    assert missed(stamps, late, slice(None)) == (2, 2)
+    assert missed(stamps, late, slice(0, 9)) == (2, 0)
 
 
 def test_a_rate_above_the_clocks_is_refused(capsys: pytest.CaptureFixture):
