@@ -21,9 +21,21 @@ from iga_drake.station.panda.model import POSITION_LOWER, POSITION_UPPER
 from iga_drake.systems.ports import PANDA_JOINTS, ArmMode
 
 _HAND_PERIOD = 0.1  # s
+_SHORT = 2  # ms
 _HAND_SAME = 1e-4  # m
 _HELD = 0.002  # m: fingers that stop so far from where they were sent hold something
 _RECOVERY = 1.0  # s between two attempts to recover or to connect again
+
+
+def _receive_for(lcm: DrakeLcm, wait: int) -> None:
+    """Handles what comes first within `wait` ms. Drake keeps Python's lock while it waits, so that
+    no other thread runs: longer waits are slept through."""
+    if wait <= _SHORT:
+        lcm.HandleSubscriptions(wait)
+        return
+    end = time.monotonic() + wait / 1000.0
+    while not lcm.HandleSubscriptions(0) and time.monotonic() < end:
+        time.sleep(_SHORT / 1000.0)
 
 
 @dataclass
@@ -95,7 +107,7 @@ class PandaBridge:
 
     def step(self, wait: int = 2) -> None:
         """Waits up to `wait` ms for a command, hands it on and publishes the arm's status."""
-        self._lcm.HandleSubscriptions(wait)
+        _receive_for(self._lcm, wait)
         now = self._clock()
         try:
             state = self._arm.state()
@@ -252,7 +264,7 @@ class HandBridge:
 
     def step(self, wait: int = int(1000 * _HAND_PERIOD)) -> None:
         """Waits up to `wait` ms for a command, begins it and publishes the hand's status."""
-        self._lcm.HandleSubscriptions(wait)
+        _receive_for(self._lcm, wait)
         try:
             opening = self._hand.opening()
         except DriverError as error:

@@ -142,8 +142,8 @@ class Timing:
     jitter_inferring: tuple[float, float, float]
     # From a command's stamp to its arrival.
     latency: tuple[float, float, float]
-    # How often a driver's watchdog would have run out, no command for `expiry` or one that was older
-    # than that when it came: in all, and while commands changed.
+    # How often a driver's watchdog would have run out, no command for `expiry` or one that was
+    # older than that when it came: in all, and while commands changed.
     missed: int
     missed_moving: int
 

@@ -1,6 +1,7 @@
 """The Panda's driver between a bus and an arm that does what it is told."""
 
 import sys
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -282,6 +283,17 @@ def test_options_are_checked_before_anything_moves(capsys):
     for option, value in (("--speed", "3"), ("--lcm-url", "memq://"), ("--step", "9")):
         assert cli.main(["drive", "panda", "--ip", "127.0.0.1", option, value]) == cli.BAD_INPUT
         assert option.lstrip("-").replace("-", "_") in capsys.readouterr().err.replace("-", "_")
+
+
+def test_a_hand_that_waits_keeps_no_other_thread_waiting():
+    """The arm's part of the driver runs beside it."""
+    hand = SlowHand()
+    bridge = HandBridge(hand, DrakeLcm("memq://"), clock=lambda: NOW)
+    beside = threading.Thread(target=lambda: bridge.step(2000), daemon=True)
+    beside.start()
+    time.sleep(0.02)
+    assert beside.is_alive()  # Drake alone would give control back only once it is over
+    beside.join()
 
 
 def test_a_hand_that_closes_to_a_width_is_not_told_to_grasp():

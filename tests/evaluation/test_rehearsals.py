@@ -59,7 +59,8 @@ def test_the_object_that_is_furthest_counts():
 
 def test_the_summary_counts_and_takes_the_median():
     timing = {
-        "commands": 2000, "command_seconds": 10.0, "missed": 1, "missed_moving": 0, "jitter_ms": [0.1, 1.0, 9.0],
+        "commands": 2000, "command_seconds": 10.0, "missed": 1, "missed_moving": 0,
+        "jitter_ms": [0.1, 1.0, 9.0],
         "jitter_inferring_ms": [0.1, 2.0, 4.0], "latency_ms": [0.2, 0.5, 3.0],
     }  # fmt: skip
     shifts = (0.001, 0.002, 0.009)
