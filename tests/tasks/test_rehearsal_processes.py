@@ -10,7 +10,8 @@ from iga_drake.station.scenario import load_scenario
 from iga_drake.tasks.rehearsal import RehearsalClock, rehearse, timing_of
 
 
-def test_a_cell_of_processes_is_booted_seen_and_commanded():
+@pytest.mark.parametrize("driver", [False, True], ids=["lcm", "driver"])
+def test_a_cell_of_processes_is_booted_seen_and_commanded(driver: bool):
     scenario = load_scenario(
         "grasp", "hardware",
         overrides=["segmentation.source=truth", "aligner.name=expert",
@@ -28,7 +29,7 @@ def test_a_cell_of_processes_is_booted_seen_and_commanded():
             moving.append(None)
         return len(moving) < 10
 
-    rehearsed = rehearse(scenario, rate=0.1, on_event=said.append, proceed=proceed)
+    rehearsed = rehearse(scenario, rate=0.1, on_event=said.append, proceed=proceed, driver=driver)
     phases = [entry.phase for entry in rehearsed.result.timeline]
     assert phases[:3] == [Phase.OBSERVE, Phase.INFER, Phase.MOVE], rehearsed.result
     assert rehearsed.timing.count > 20
