@@ -67,7 +67,7 @@ def draw_errors(errors: Sequence[AlignmentErrors], path: Path) -> None:
             mean = getattr(each.modulo, f"{quantity}_mean")
             place = clouds.index(_clouds(each))
             if each.aligner == ORACLE:
-                named = ORACLE if place == 0 else ""
+                named = "" if ORACLE in panel.get_legend_handles_labels()[1] else ORACLE
                 panel.hlines(mean, place - 0.45, place + 0.45, "black", "dashed", label=named)
                 continue
             number = aligners.index(each.aligner)
