@@ -33,6 +33,8 @@ _HAND_TICK = 0.05  # s (wall clock: clients don't wait for long) between states 
 _BEHIND = 0.05  # s (wall clock) after which lost ticks are given up
 # A command may be so many times as fast as the joints' limit.
 _DISCONTINUITY = 1.2
+_EXTRAPOLATED = 20  # ticks without a command for which the arm goes on
+_REMEMBERED = 100  # states that a command may answer
 _STALL, _STALL_TIME, _WIDTH = 2e-4, 0.3, 1e-3  # m, s, m: when fingers have come to rest
 _HEADER, _HAND_HEADER = struct.Struct("<III"), struct.Struct("<HII")
 _DOUBLES = 284  # of a state, between its number and its modes
@@ -194,9 +196,10 @@ class FciArm(_Server):
     """The arm's server.
 
     It follows joint positions under the robot's own controller, as `franka-rs` does with the
-    backend "robot"; other motions are refused. The arm stops in a reflex where a command isn't
-    finite, is outside the joints' limits or jumps, and where commands fail to come; `reflex` and
-    `mode` play what else may happen to an arm.
+    backend "robot"; other motions are refused. A command counts from the state that it answers; for
+    up to 20 ticks without one the arm goes on at its acceleration. It stops in a reflex where a
+    command isn't finite, is outside the joints' limits or jumps, and where commands fail to come;
+    `reflex` and `mode` play what else may happen to an arm.
     """
 
     def __init__(
@@ -216,6 +219,8 @@ class FciArm(_Server):
         self._motion: int | None = None  # number of the command that began it
         # Of the last commands, rad/s and rad/s^2, as clients limit their own by them.
         self._velocity = self._acceleration = np.zeros(PANDA_JOINTS)
+        # What the last states told, by their numbers: desired angles and velocities.
+        self._told: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._answers: list[tuple[int, int, int]] = []
         self._lock = threading.Lock()
         super().__init__(address, ARM_PORT, rate)
@@ -240,7 +245,6 @@ class FciArm(_Server):
 
     def _serve(self, client: socket.socket, states: socket.socket) -> None:
         connected, number, silence = False, 0, 0
-        last: np.ndarray | None = None
         for _ in self._ticks(_TICK / self._rate):
             while _waiting(client):
                 command, call, size = _HEADER.unpack(_receive(client, _HEADER.size))
@@ -257,18 +261,18 @@ class FciArm(_Server):
                 elif connected:
                     with self._lock:
                         self._do(command, call, payload)
-                    silence, last = 0, None
+                    silence = 0
             if not connected:
                 continue
-            position, finished = _last_command(states)
+            position, answered, finished = _last_command(states)
             with self._lock:
                 if self._motion is not None:
                     if position is None:
                         silence += 1
-                        if silence > self._patience:
-                            self._stop(FciMode.REFLEX, _REFLEX, _COMMUNICATION)
+                        self._go_on(silence)
                     else:
-                        last, silence = self._follow(position, last, silence), 0
+                        silence = 0
+                        self._follow(position, min(answered, number), number)
                         if finished and self._motion is not None:
                             self._answers.append((_Command.MOVE, self._motion, _SUCCESS))
                             self._motion, self.mode = None, FciMode.IDLE
@@ -309,23 +313,36 @@ class FciArm(_Server):
         desired = state.position_commanded
         return state.position if desired is None else desired
 
-    def _follow(
-        self, position: np.ndarray, last: np.ndarray | None, silence: int
-    ) -> np.ndarray | None:
-        before = self._desired(self._plant.read()) if last is None else last
-        step = _DISCONTINUITY * np.array(VELOCITY_LIMIT) * _TICK * (silence + 1)
+    def _go_on(self, silence: int) -> None:
+        """A tick of a motion for which no command came, the `silence`-th in a row."""
+        if silence > self._patience:
+            self._stop(FciMode.REFLEX, _REFLEX, _COMMUNICATION)
+        elif silence <= _EXTRAPOLATED:
+            self._extrapolate(self._desired(self._plant.read()), 1)
+        else:
+            self._velocity = self._acceleration = np.zeros(PANDA_JOINTS)
+
+    def _follow(self, position: np.ndarray, answered: int, number: int) -> None:
+        """A command that answers the state `answered`; the last one told was `number`."""
+        present = self._desired(self._plant.read()), self._velocity
+        before, velocity = self._told.get(answered, present)
         inside = (position >= POSITION_LOWER) & (position <= POSITION_UPPER)
         if not inside.all():  # what isn't finite is not inside
             self._stop(FciMode.REFLEX, _REFLEX, _RANGE)
-            return None
-        if (np.abs(position - before) > step).any():
+            return
+        if (np.abs(position - before) > _DISCONTINUITY * np.array(VELOCITY_LIMIT) * _TICK).any():
             self._stop(FciMode.REFLEX, _REFLEX, _VELOCITY_DISCONTINUITY)
-            return None
-        velocity = (position - before) / (_TICK * (silence + 1))
-        self._acceleration = (velocity - self._velocity) / (_TICK * (silence + 1))
-        self._velocity = velocity
-        self._plant.command(position)
-        return position
+            return
+        self._velocity = (position - before) / _TICK
+        self._acceleration = (self._velocity - velocity) / _TICK
+        self._extrapolate(position, min(number - answered, _EXTRAPOLATED))
+
+    def _extrapolate(self, position: np.ndarray, ticks: int) -> None:
+        """Commands where `position` leads in so many ticks at the present acceleration."""
+        for _ in range(ticks):
+            self._velocity = self._velocity + _TICK * self._acceleration
+            position = position + _TICK * self._velocity
+        self._plant.command(np.clip(position, POSITION_LOWER, POSITION_UPPER))
 
     def _state(self, number: int) -> bytes:
         state = self._plant.read()
@@ -337,6 +354,8 @@ class FciArm(_Server):
         moves = self._motion is not None
         if not moves:
             self._velocity = self._acceleration = np.zeros(PANDA_JOINTS)
+        self._told[number] = desired.copy(), self._velocity
+        self._told.pop(number - _REMEMBERED, None)
         values[122:124] = values[124:126] = (state.position[2], -1.0)  # elbow
         for place, vector in (
             (147, state.position), (154, desired), (161, state.velocity),
@@ -349,17 +368,19 @@ class FciArm(_Server):
         return _STATE.pack(number, *values, *modes, *errors, self.mode, 1.0)
 
 
-def _last_command(states: socket.socket) -> tuple[np.ndarray | None, bool]:
-    """Joint angles (7,) (rad) of the last command that has come, and whether a motion ends."""
-    position, finished = None, False
+def _last_command(states: socket.socket) -> tuple[np.ndarray | None, int, bool]:
+    """Joint angles (7,) (rad) of the last command that has come, the number of the state that it
+    answers, and whether a motion ends."""
+    position, answered, finished = None, 0, False
     while True:
         try:
             data = states.recv(2048)
         except OSError:  # nothing more, or the client's socket is gone
-            return position, finished
+            return position, answered, finished
         if len(data) == _COMMAND.size:
             values = _COMMAND.unpack(data)
-            position, finished = np.array(values[1:8]), finished or bool(values[40])
+            position, answered = np.array(values[1:8]), int(values[0])
+            finished = finished or bool(values[40])
 
 
 class FciHand(_Server):
