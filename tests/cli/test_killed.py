@@ -11,6 +11,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -19,20 +20,49 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from demonstration_fakes import make_demonstration
 
 from iga_drake import cli
 from iga_drake.checkpoint import load_checkpoint
+from iga_drake.demonstrations.demonstration import Demonstration
 
 KILLS = int(os.environ.get("IGA_KILLS", "2"))
 # Processes that have the modules already: of a short command most is their import.
 PROCESSES = multiprocessing.get_context("forkserver")
-PROCESSES.set_forkserver_preload(["iga_drake.cli.train", "iga_drake.cli.dataset", "test_killed"])
+PROCESSES.set_forkserver_preload(
+    ["iga_drake.cli.train", "iga_drake.cli.dataset", "iga_drake.tasks.episode", "test_killed"]
+)
+
+
+class Here:
+    """Runs in this process, at once, what is given to a pool of processes."""
+
+    def __init__(self, *_, **__) -> None:
+        pass
+
+    def submit(self, function: Callable, *arguments: object) -> Future:
+        done: Future = Future()
+        done.set_result(function(*arguments))
+        return done
+
+    def shutdown(self, **_) -> None:
+        pass
+
+
+def attempted(scenario: object, seed: int) -> Demonstration | None:
+    """An attempt that needs no simulation; one in three fails."""
+    time.sleep(0.05)
+    return None if seed % 3 == 1 else make_demonstration(seed)
 
 
 def run_command(arguments: list[str], errors: str) -> None:
     """Runs `iga` and ends this process with its status."""
+    from iga_drake.cli import demonstrate
+    from iga_drake.tasks import episode
     from iga_drake.training import peers
 
+    demonstrate.ProcessPoolExecutor = Here  # type: ignore[assignment, misc]
+    episode.attempt_demonstration = attempted  # type: ignore[assignment]
     # Validation takes its samples from the evaluation's settings, which is slow.
     peers.alignment_errors = lambda aligner, count: {  # type: ignore[assignment]
         name: float(count)
@@ -117,6 +147,7 @@ CASES: dict[str, Case] = {
         "--results",
         errors_of,
     ),
+    "demonstrate": (["demonstrate", "grasp", "--count", 8], "--out", bytes_of),
     "export": (
         ["dataset", "export", "--set", "train", "--count", 12, "--shard-size", 3],
         "--out",
