@@ -51,7 +51,7 @@ docs: develop
 	@echo "outputs/site/index.html"
 
 test: check docs $(VENV)/.browser
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --nbmake tests notebooks
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --nbmake notebooks tests
 
 # Many more inputs for the property tests; FUZZ_INPUTS of each, which follow from FUZZ_SEED.
 FUZZ_INPUTS ?= 2000

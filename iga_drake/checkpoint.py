@@ -181,3 +181,15 @@ def network_digest(network: torch.nn.Module) -> str:
         found.update(f"{name} {tensor.dtype} {tuple(tensor.shape)} ".encode())
         found.update(tensor.detach().cpu().reshape(-1).view(torch.uint8).numpy().tobytes())
     return found.hexdigest()[:16]
+
+
+def with_digest(
+    given: Network | Path | str, load: Callable[[Path], tuple[Network, dict]]
+) -> tuple[Network, dict | None, str]:
+    """A network that is given itself, or as a file that `load` reads: the network, the file's card
+    (None without a file), and the digest that its results are known by."""
+    if isinstance(given, torch.nn.Module):
+        return given, None, network_digest(given)
+    path = Path(given)
+    network, card = load(path)
+    return network, card, file_digest(path)

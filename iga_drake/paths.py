@@ -23,6 +23,11 @@ def models_dir() -> Path:
     return _data_dir("models")
 
 
+def landed_weights(name: str) -> Path:
+    """The checkpoint that comes with the package: "descriptor", "energy", "reldist" and so on."""
+    return models_dir() / "weights" / f"{name}.safetensors"
+
+
 def diagrams_dir() -> Path:
     """The `diagrams/` folder: scenario YAML files."""
     return _data_dir("diagrams")

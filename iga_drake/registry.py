@@ -1,7 +1,8 @@
 """Finds things by name: in the modules of one package, and in installed packages of others.
 
 A module of the package states what it has in a dictionary at module level, such as
-`ALIGNERS = {"icp": make_icp}`; another package states an entry point, such as
+`ALIGNERS = {"icp": make_icp}`, or `{"icp": "package.module:make_icp"}` where that module is slow to
+import; another package states an entry point, such as
 
     [project.entry-points."iga_drake.aligners"]
     mine = "my_package.aligner:MyAligner"
@@ -24,7 +25,7 @@ class Registry(Generic[T]):
     Args:
       kind: what the factories make, for messages: "aligner".
       package: full name of the package whose modules (or subpackages) are searched.
-      attribute: name of the modules' dictionary from name to factory.
+      attribute: name of the modules' dictionary from name to factory, or to where one is.
       group: the entry points' group; an entry point's object is a factory.
       error: raised for names that are unknown, stated twice, or whose entry point doesn't load.
       reserved: names that can't be given to anything.
@@ -57,6 +58,8 @@ class Registry(Generic[T]):
         """The factory called `name`. Raises `error` if it is unknown or does not load."""
         self.check(name)
         found = self._found()[name]
+        if isinstance(found, str):
+            return pkgutil.resolve_name(found)
         if not isinstance(found, EntryPoint):
             return found
         try:
@@ -74,7 +77,7 @@ class Registry(Generic[T]):
         return loaded
 
     def _found(self) -> dict[str, Any]:
-        """Name -> factory, or the entry point that loads one."""
+        """Name -> factory, where one is, or the entry point that loads one."""
         found: dict[str, Any] = {}
         places = dict.fromkeys(self.reserved, "this package, which keeps it for a use of its own")
 

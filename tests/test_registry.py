@@ -45,6 +45,13 @@ def test_one_file_is_enough(registry: Registry, tmp_path: Path) -> None:
     assert registry.factory("mocha")() == "a cup of mocha"
 
 
+def test_a_place_is_imported_when_it_is_asked_for(registry: Registry, tmp_path: Path) -> None:
+    (tmp_path / "slow_cups.py").write_text("def make(): return 'a cup of mocha'\n")
+    add_module(registry, tmp_path, "mocha", "CUPS = {'mocha': 'slow_cups:make'}\n")
+    assert registry.names() == ["mocha", "tea"] and "slow_cups" not in sys.modules
+    assert registry.factory("mocha")() == "a cup of mocha"
+
+
 def test_an_entry_point_is_loaded_when_it_is_asked_for(registry: Registry, tmp_path: Path) -> None:
     (tmp_path / "cafe_module.py").write_text("def make(): return 'a cup of water'\n")
     add_distribution(tmp_path, "water = cafe_module:make")

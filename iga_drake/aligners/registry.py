@@ -42,9 +42,8 @@ def make_aligner(name: str, **options: Any) -> Aligner:
     package that it needs and that isn't there, and for an aligner that can't be asked as the
     protocol says.
     """
-    factory = _REGISTRY.factory(name)
     try:
-        aligner = factory(**options)
+        aligner = _REGISTRY.factory(name)(**options)
     except ImportError as error:
         raise AlignerError(
             f"aligner '{name}': a package that it needs can't be imported ({error_text(error)}): "

@@ -50,10 +50,20 @@ def run(arguments: argparse.Namespace) -> int:
     limits.check()
     robot = connect_franka(arguments.ip)
     arm = FrankaRsArm(robot, speed=speed)
+
+    def arm_again() -> FrankaRsArm:
+        return FrankaRsArm(connect_franka(arguments.ip), speed=speed)
+
+    def hand_again() -> FrankaRsHand:
+        return FrankaRsHand(connect_franka(arguments.ip), home=False)
+
     if not arguments.no_hand:
-        hand = HandBridge(FrankaRsHand(robot, home=not arguments.no_homing), DrakeLcm(url))
+        device = FrankaRsHand(robot, home=not arguments.no_homing)
+        hand = HandBridge(device, DrakeLcm(url), reconnect=hand_again)
         threading.Thread(target=_forever, args=(hand,), daemon=True).start()
-    bridge = PandaBridge(arm, DrakeLcm(url), limits=limits, recover=arguments.recover)
+    bridge = PandaBridge(
+        arm, DrakeLcm(url), limits=limits, recover=arguments.recover, reconnect=arm_again
+    )
     arm.start()
     print(f"driving the arm at {arguments.ip} on {url}; Ctrl-C ends", flush=True)
     try:
@@ -62,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         return SUCCESS
     finally:
-        arm.stop()
+        bridge.stop()
 
 
 def _forever(hand: "HandBridge") -> None:

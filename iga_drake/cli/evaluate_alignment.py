@@ -15,6 +15,7 @@ from iga_drake.cli.status import CommandError
 from iga_drake.errors import kept_on_interrupt
 from iga_drake.evaluation.results import ResultsStore, results_file, results_kept
 from iga_drake.files import output_file, write_text
+from iga_drake.viewing.figures import figure_file
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,6 +76,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--card", type=card, help="write a model card of iga's weights, or of a single peer's"
     )
     parser.add_argument("--energy-card", type=card, help="write one of its energy")
+    markdown = partial(output_file, begins=(b"Mean errors",))
+    parser.add_argument(
+        "--markdown", type=markdown, metavar="FILE", help="write the errors as tables"
+    )
+    parser.add_argument("--png", type=figure_file, metavar="FILE", help="draw the mean errors")
     parser.add_argument("--json", action="store_true", help="print the errors as JSON")
 
 
@@ -89,6 +95,7 @@ def run(arguments: argparse.Namespace) -> None:
         evaluate_alignment,
         own_objects,
     )
+    from iga_drake.evaluation.alignment_reports import draw_errors, markdown_errors
 
     sets, config, asked = arguments.sets or EVALUATION_SETS, CONFIG, arguments.aligner
     mine = arguments.meshes or arguments.relations
@@ -139,6 +146,10 @@ def run(arguments: argparse.Namespace) -> None:
                 print(by_category(rows))
     if arguments.json:
         print(json.dumps([asdict(summary) for summary in summaries], indent=2))
+    if arguments.markdown:
+        write_text(arguments.markdown, markdown_errors(summaries))
+    if arguments.png:
+        draw_errors(summaries, arguments.png)
     _write_cards(arguments, summaries)
 
 
@@ -163,18 +174,16 @@ def _own_objects(arguments: argparse.Namespace) -> dict[str, Any]:
 def _write_cards(arguments: argparse.Namespace, summaries: list) -> None:
     if not arguments.card and not arguments.energy_card:
         return
-    from iga_drake.aligners.iga.aligner import default_energy, default_weights
     from iga_drake.aligners.iga.weights import DESCRIPTOR, ENERGY
     from iga_drake.aligners.peers import ALIGNERS as PEERS
-    from iga_drake.aligners.peers.networks import landed_weights
     from iga_drake.evaluation.alignment import model_card
+    from iga_drake.paths import landed_weights
 
     if arguments.card:
         name = arguments.aligner[0]
-        peer = len(arguments.aligner) == 1 and name in PEERS
-        landed, kind = (landed_weights(name), name) if peer else (default_weights(), DESCRIPTOR)
-        weights = Path(arguments.weights or landed)
+        kind = name if len(arguments.aligner) == 1 and name in PEERS else DESCRIPTOR
+        weights = Path(arguments.weights or landed_weights(kind))
         write_text(arguments.card, model_card(weights, summaries, kind=kind))
     if arguments.energy_card:
-        energy = Path(arguments.energy or default_energy())
+        energy = Path(arguments.energy or landed_weights(ENERGY))
         write_text(arguments.energy_card, model_card(energy, summaries, kind=ENERGY))

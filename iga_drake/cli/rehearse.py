@@ -1,7 +1,6 @@
-"""`iga rehearse`: one episode through LCM and the hardware station, on a simulated cell."""
+"""`iga rehearse`: episodes through LCM and the hardware station, on a simulated cell."""
 
 import argparse
-import dataclasses
 import json
 
 from iga_drake.cli.options import add_aligner_options, add_result_argument, aligner_options, seed
@@ -14,6 +13,8 @@ from iga_drake.cli.scenarios import (
     with_aligner,
 )
 from iga_drake.cli.status import FAILURE, SUCCESS, CommandError
+from iga_drake.errors import kept_on_interrupt
+from iga_drake.evaluation.results import ResultsStore, results_file, results_kept
 from iga_drake.files import write_text
 
 
@@ -23,6 +24,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_cell_argument(parser)
     add_demonstrations_argument(parser)
     parser.add_argument("--seed", type=seed, default=0, help="scene, noise and aligner")
+    parser.add_argument(
+        "--count", type=int, default=1, metavar="N", help="rehearse N seeds, from --seed on"
+    )
+    parser.add_argument(
+        "--compare", action="store_true",
+        help="run each episode on the simulated station alone, too: same verdict, and how far the "
+        "objects and the end effector are apart in the end; ends with 1 where a verdict differs",
+    )  # fmt: skip
+    parser.add_argument(
+        "--results", type=results_file, help="results file to append to and to go on from"
+    )
     parser.add_argument(
         "--aligner", metavar="NAME",
         help="default: the scenario's; expert: poses of the scripted expert, which sees all",
@@ -37,6 +49,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "machine is too slow); default: in this process, on simulated time, so that it can be "
         "repeated exactly",
     )  # fmt: skip
+    parser.add_argument(
+        "--driver", action="store_true",
+        help="with --realtime: let the simulated arm speak the robot's own protocol, with the "
+        "driver's process of `iga drive panda` between it and LCM (needs the extra `franka`)",
+    )  # fmt: skip
     add_record_arguments(parser)
     add_result_argument(parser)
 
@@ -46,38 +63,44 @@ def run(arguments: argparse.Namespace) -> int:
     rate = arguments.realtime
     if rate is not None and not 0.01 <= rate <= 1.0:
         raise CommandError(f"--realtime {rate:g}: 0.01 to 1 is expected")
+    from iga_drake.evaluation.rehearsals import rehearse_seeds, summary_of
+
     with_cell(arguments)
     scenario = scenario_of(arguments)
     name = arguments.aligner or scenario.aligner.name
     scenario = with_aligner(scenario, name, aligner_options(arguments, [name])[name])
+    if arguments.driver and rate is None:
+        raise CommandError("--driver: it keeps the clock's pace; give a rate, --realtime 1")
+    if arguments.count < 1:
+        raise CommandError(f"--count {arguments.count}: at least 1 is needed")
+    for option in ("record", "result"):
+        if getattr(arguments, option) and arguments.count > 1:
+            raise CommandError(f"--{option}: of one rehearsal, not of {arguments.count}")
+    seeds = range(arguments.seed, arguments.seed + arguments.count)
     where = "in this process" if rate is None else f"in real time, rate {rate:g}"
-    told = f"seed {arguments.seed}, aligner {name}, {arguments.split} objects"
+    told = f"seed {arguments.seed}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}"
+    told += f", aligner {name}, {arguments.split} objects"
     print(f"{scenario.task.name}, {told}: rehearsal {where}", flush=True)
-    record = log_request(arguments)
-    if rate is None:
-        from iga_drake.tasks.episode import Episode
-
-        policy = dataclasses.replace(scenario.policy, inference="lockstep")
-        scenario = dataclasses.replace(scenario, station="rehearsal", policy=policy)
-        with Episode(
-            scenario, seed=arguments.seed, split=arguments.split, record=record
-        ) as episode:
-            result = episode.run(lambda line: print(line, flush=True))
-        tell_of_log(episode.log)
-        row, success = result.row(), result.success
-    else:
-        from iga_drake.tasks.rehearsal import rehearse
-
-        rehearsed = rehearse(
+    with kept_on_interrupt(lambda: results_kept(arguments.results)):
+        rows, comparisons = rehearse_seeds(
             scenario,
-            seed=arguments.seed,
+            seeds,
             split=arguments.split,
             rate=rate,
-            record=record,
+            in_process=arguments.compare,
+            driver=arguments.driver,
+            store=ResultsStore(arguments.results) if arguments.results else None,
+            record=log_request(arguments),
             on_event=lambda line: print(line, flush=True),
+            on_log=tell_of_log,
         )
-        print(rehearsed, flush=True)
-        row, success = rehearsed.row(), bool(rehearsed.result.success)
+    if len(rows) > 1:
+        print("\n".join(summary_of(rows, comparisons)), flush=True)
     if arguments.result:
-        write_text(arguments.result, json.dumps(row) + "\n")
-    return SUCCESS if success else FAILURE
+        write_text(arguments.result, json.dumps(rows[0]) + "\n")
+    good = (
+        all(comparison.same for comparison in comparisons)
+        if arguments.compare
+        else all(row["success"] for row in rows)
+    )
+    return SUCCESS if good else FAILURE

@@ -114,7 +114,7 @@ class Sample:
         default_factory=lambda: np.empty((2, 0, 2, 3), np.float32)
     )
     # (2, S, 2, 3) m: evenly dense points and normals of the canonical instances, in their frames;
-    # S = 0 but for meshes in their own sizes.
+    # S = 0 unless the options say `test_surface`, and where a role's objects have different forms.
     form: np.ndarray = field(default_factory=lambda: np.empty((2, 0, 2, 3), np.float32))
 
     @property
@@ -144,10 +144,9 @@ class Sample:
 
     def _found(self, role: int, tolerance: float) -> np.ndarray:
         own = find_symmetries(*np.moveaxis(self.surface[role], 1, 0), tolerance=tolerance)
-        if self.category[role] in FAMILIES or not self.canonical_surface.shape[1]:
+        if self.category[role] in FAMILIES or not self.form.shape[1]:
             return own
-        form = self.form if self.form.shape[1] else self.canonical_surface
-        turns = find_symmetries(*np.moveaxis(form[role], 1, 0), tolerance=tolerance)[1:]
+        turns = find_symmetries(*np.moveaxis(self.form[role], 1, 0), tolerance=tolerance)[1:]
         points = self.canonical_surface[role, :, 0]
         return np.concatenate((own, _carried(turns, points, self.surface[role, :, 0])))
 
@@ -173,7 +172,8 @@ class _Object:
     spacing: np.ndarray  # (N + 1,) m between neighbouring points
     axis: np.ndarray  # (2, 3) of the test instance: point and direction
     up: np.ndarray  # (3,) in every instance's own frame, or 0
-    form: np.ndarray | None = None  # (S, 2, 3), see `Sample.form`
+    # (S, 2, 3), see `Sample.form`; None unless the options say `test_surface`.
+    form: np.ndarray | None = None
     corresponding: bool = True  # whether the points are the same on all instances
 
 
@@ -304,7 +304,7 @@ def _instances(chosen: SampleSet, k: int, role: int, config: SampleConfig) -> _O
     elif category == COMPOSITE or lies.random() >= STANDING:
         up = _direction(lies)
     form = None
-    if config.mesh_unit and category not in FAMILIES:
+    if config.test_surface:
         even = chosen.rng("instances", k, role, chosen.pairs + 3)
         points, normals, _ = surface_points(even, vertices[:1], faces, config.surface_points)
         form = np.stack((points[0], normals[0]), 1)
@@ -642,7 +642,7 @@ def _observe(
     surface = np.stack((points[-1], normals[-1]), 2).astype(np.float32)
     canonical_surface = np.stack([np.stack((o.points[0], o.normals[0]), 1) for o in objects])
     forms = [shape.form for shape in objects if shape.form is not None]
-    if len(forms) < 2 or not config.test_surface:
+    if len(forms) < 2:
         forms = [np.empty((0, 2, 3))] * 2
     if not config.test_surface:
         surface = surface[:, :0]

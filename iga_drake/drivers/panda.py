@@ -21,8 +21,21 @@ from iga_drake.station.panda.model import POSITION_LOWER, POSITION_UPPER
 from iga_drake.systems.ports import PANDA_JOINTS, ArmMode
 
 _HAND_PERIOD = 0.1  # s
+_SHORT = 2  # ms
 _HAND_SAME = 1e-4  # m
-_RECOVERY = 1.0  # s between two attempts
+_HELD = 0.002  # m: fingers that stop so far from where they were sent hold something
+_RECOVERY = 1.0  # s between two attempts to recover or to connect again
+
+
+def _receive_for(lcm: DrakeLcm, wait: int) -> None:
+    """Handles what comes first within `wait` ms. Drake keeps Python's lock while it waits, so that
+    no other thread runs: longer waits are slept through."""
+    if wait <= _SHORT:
+        lcm.HandleSubscriptions(wait)
+        return
+    end = time.monotonic() + wait / 1000.0
+    while not lcm.HandleSubscriptions(0) and time.monotonic() < end:
+        time.sleep(_SHORT / 1000.0)
 
 
 @dataclass
@@ -54,7 +67,8 @@ class PandaBridge:
     after a pause and isn't where the arm's target is. One that jumps, that is for another control
     mode, or an arm that doesn't follow, is a fault: the arm stays where its target is, for good,
     and its mode is told as `ArmMode.IDLE`. A driver that lost its arm in a reflex starts to follow
-    again, from where the arm is, only if it was told to recover.
+    again, from where the arm is, only if it was told to recover. While the arm's link is broken no
+    status is told.
     """
 
     def __init__(
@@ -64,13 +78,18 @@ class PandaBridge:
         *,
         limits: DriverLimits | None = None,
         recover: bool = False,
+        reconnect: Callable[[], Arm] | None = None,
         clock: Callable[[], float] = time.time,
         log: Callable[[str], None] = print,
     ) -> None:
-        """`lcm` is pumped by `step` alone. Raises `ConfigError`."""
+        """`lcm` is pumped by `step` alone. `reconnect` is asked for the arm anew, once a second,
+        where its link broke; it raises `DriverError` while it can't. None: `step` raises then.
+
+        Raises `ConfigError`.
+        """
         self._limits = limits or DriverLimits()
         self._limits.check()
-        self._arm, self._lcm, self._recover = arm, lcm, recover
+        self._arm, self._lcm, self._recover, self._reconnect = arm, lcm, recover, reconnect
         self._clock, self._log = clock, log
         self.fault = ""  # why nothing is let through any more
         self._command: lcmt_panda_command | None = None
@@ -88,12 +107,21 @@ class PandaBridge:
 
     def step(self, wait: int = 2) -> None:
         """Waits up to `wait` ms for a command, hands it on and publishes the arm's status."""
-        self._lcm.HandleSubscriptions(wait)
-        now, state = self._clock(), self._arm.state()
+        _receive_for(self._lcm, wait)
+        now = self._clock()
+        try:
+            state = self._arm.state()
+        except DriverError as error:
+            if self._reconnect is None:
+                raise
+            self._command = self._target = None
+            self._tell(f"the arm's link is broken: {error_text(error)}")
+            self._connect_again(now, self._reconnect)
+            return
         following = self._arm.running and state.mode is ArmMode.READY
         if not following:
             self._target = None
-            if self._recover and now - self._recovered > _RECOVERY:
+            if self._recover and abs(now - self._recovered) > _RECOVERY:
                 self._recovered = now
                 self._restart(state)
         elif self._target is None:
@@ -118,6 +146,23 @@ class PandaBridge:
         )
         message.control_mode = messages.CONTROL_MODES["position"]
         self._lcm.Publish(messages.STATUS_CHANNEL, message.encode())
+
+    def stop(self) -> None:
+        """Lets the arm come to rest; it follows no more."""
+        self._arm.stop()
+
+    def _connect_again(self, now: float, reconnect: Callable[[], Arm]) -> None:
+        if abs(now - self._recovered) <= _RECOVERY:  # a clock may jump
+            return
+        self._recovered = now
+        try:
+            arm = reconnect()
+            arm.start()
+        except DriverError as error:
+            self._tell(f"no connection yet: {error_text(error)}")
+            return
+        self._arm = arm
+        self._log("the arm is there again")
 
     def _restart(self, state: ArmState) -> None:
         if state.mode not in (ArmMode.REFLEX, ArmMode.IDLE, ArmMode.READY):
@@ -160,7 +205,7 @@ class PandaBridge:
             joint = int(outside[0])
             return self._fail(f"a command of {position[joint]:.3f} rad for joint {joint + 1}")
         far = float(np.abs(position - target).max())
-        if now - self._accepted > limits.expiry and far > limits.resume:
+        if abs(now - self._accepted) > limits.expiry and far > limits.resume:
             return (
                 f"a first command {far:.3f} rad from the arm's target is dropped: begin where the "
                 "arm is"
@@ -189,8 +234,9 @@ class PandaBridge:
 class HandBridge:
     """Passes the hand's commands on, and its opening back, one step at a time.
 
-    A command that opens is a move, one that closes a grasp. What is commanded again is not done
-    again; a new command ends the motion under way.
+    A command is a move; where it closes and something is in the way, a grasp follows, which presses
+    with the force commanded (a grasp alone would close all the way where nothing is). What is
+    commanded again is not done again; a new command ends the motion under way.
     """
 
     def __init__(
@@ -198,14 +244,17 @@ class HandBridge:
         hand: Hand,
         lcm: DrakeLcm,
         *,
+        reconnect: Callable[[], Hand] | None = None,
         clock: Callable[[], float] = time.time,
         log: Callable[[str], None] = print,
     ) -> None:
-        """`lcm` is pumped by `step` alone."""
+        """`lcm` is pumped by `step` alone; `reconnect` is as `PandaBridge`'s."""
         self._hand, self._lcm, self._clock, self._log = hand, lcm, clock, log
+        self._reconnect, self._tried = reconnect, -np.inf
         self._command: lcmt_schunk_wsg_command | None = None
         self._last: float | None = None
         self._motion: threading.Thread | None = None
+        self._ended = threading.Event()  # set where the motion is to end
         lcm.Subscribe(messages.HAND_COMMAND_CHANNEL, self._receive)
 
     def _receive(self, data: bytes) -> None:
@@ -215,8 +264,15 @@ class HandBridge:
 
     def step(self, wait: int = int(1000 * _HAND_PERIOD)) -> None:
         """Waits up to `wait` ms for a command, begins it and publishes the hand's status."""
-        self._lcm.HandleSubscriptions(wait)
-        opening = self._hand.opening()
+        _receive_for(self._lcm, wait)
+        try:
+            opening = self._hand.opening()
+        except DriverError as error:
+            if self._reconnect is None:
+                raise
+            self._command = self._last = None
+            self._connect_again(error, self._reconnect)
+            return
         command, self._command = self._command, None
         if command is not None:
             target = max(command.target_position_mm / 1000.0, 0.0)
@@ -225,17 +281,34 @@ class HandBridge:
         status = messages.hand_status(opening, utime=utime_of(self._clock()))
         self._lcm.Publish(messages.HAND_STATUS_CHANNEL, status.encode())
 
+    def _connect_again(self, error: DriverError, reconnect: Callable[[], Hand]) -> None:
+        now = self._clock()
+        if abs(now - self._tried) <= _RECOVERY:
+            return
+        self._tried = now
+        try:
+            self._hand = reconnect()
+            self._log("the hand is there again")
+        except DriverError:
+            self._log(f"the hand's link is broken: {error_text(error)}")
+
     def _begin(self, target: float, opening: float, force: float) -> None:
         if self._motion is not None and self._motion.is_alive():
+            self._ended.set()
             self._hand.stop()
             self._motion.join()
         self._last = target
+        self._ended = ended = threading.Event()
 
         def move() -> None:
             try:
+                self._hand.move(target)
+            except DriverError as error:
                 if target > opening:
-                    self._hand.move(target)
-                else:
+                    self._log(f"hand: {error_text(error)}")
+            try:
+                blocked = self._hand.opening() > target + _HELD
+                if target <= opening and blocked and not ended.is_set():
                     self._hand.grasp(target, force)
             except DriverError as error:
                 self._log(f"hand: {error_text(error)}")

@@ -70,6 +70,9 @@ class PolicyConfig:
     observe_limit: float = 20.0
     # Fewest usable points of an observed cloud.
     minimum_points: int = 64
+    # Largest share of an observed cloud that may lie on the robot, in [0, 1]: above it the robot's
+    # pixels are labelled as the object's. 1 refuses nothing.
+    maximum_on_robot: float = 0.3
     # Fewest cameras without a fault: with as many, the others are left out. null: all have to be.
     minimum_cameras: int | None = None
     # Limit (s) of each way to where the hand shows its object to the cameras.
@@ -102,6 +105,7 @@ class PolicyConfig:
             "observe_retry": (1e-3, 60.0),
             "minimum_points": (0, 100_000),
             "infer_delay": (0.0, 60.0),
+            "maximum_on_robot": (0.0, 1.0),
             "minimum_familiarity": (0.0, 1.0),
             "minimum_confidence": (0.0, 1.0),
         }
@@ -179,6 +183,7 @@ class PolicyMemory:
         return self
 
 
+OnRobot = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 _Step = Callable[[PolicyMemory, PolicyInputs, float], PolicyMemory]
 
 
@@ -193,6 +198,8 @@ class PolicyMachine:
         solve: inverse kinematics, `solve(X_WE, q_near) -> (7,) rad or None`.
         workspace: corners (3,) (m, in W), lower and upper, of the box in which E has to stay: poses
             outside are refused.
+        on_robot: points (P, 3) (m, in W), joint angles (7,) (rad), opening (m) -> (P,) bool, which
+            points lie on the robot; None asks nobody.
         seed: given to the aligner.
     """
 
@@ -206,6 +213,7 @@ class PolicyMachine:
         solve: Callable[[RigidTransform, np.ndarray], np.ndarray | None],
         config: PolicyConfig | None = None,
         workspace: Workspace | None = None,
+        on_robot: OnRobot | None = None,
         seed: int = 0,
     ) -> None:
         if demonstrations is not None:
@@ -224,6 +232,7 @@ class PolicyMachine:
         self._solve = solve
         self._seed = seed
         self._workspace = workspace
+        self._on_robot = on_robot
 
     def start(self) -> PolicyMemory:
         """The memory before the first tick: the arm stays, the hand keeps its approach opening."""
@@ -371,6 +380,7 @@ class PolicyMachine:
                 minimum=self.config.minimum_points,
                 why=lambda: inputs.losses(plan.role),
             )
+            self._check_off_robot(points, plan.name, inputs, memory.target.opening_reached)
         except Refusal as refusal:
             again = now + self.config.observe_retry
             if again - memory.phase_started > self.config.observe_limit:
@@ -382,6 +392,21 @@ class PolicyMachine:
             points = (inputs.pose().inverse() @ points.T).T
         memory = self._note(memory, inputs, now, plan, points)
         return self._continue(memory, inputs, now, f"{plan.name} {len(points)} points")
+
+    def _check_off_robot(
+        self, points: np.ndarray, name: str, inputs: PolicyInputs, opening: float
+    ) -> None:
+        if self._on_robot is None:
+            return
+        share = float(self._on_robot(points, inputs.position(), opening).mean())
+        if share > self.config.maximum_on_robot:
+            raise Refusal(
+                f"{100 * share:.0f} % of the points of '{name}' lie on the robot, at most "
+                f"{100 * self.config.maximum_on_robot:.0f} % are allowed "
+                "(policy.maximum_on_robot): the robot is in the object's mask; look at the labels, "
+                "the cameras' poses and the joints",
+                Cause.PERCEPTION,
+            )
 
     def _start_present(
         self, memory: PolicyMemory, plan: ObservationPlan, now: float, detail: str

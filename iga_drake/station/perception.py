@@ -1,7 +1,9 @@
 """Adds the fusion of camera images beside a station that exports the port contract."""
 
 from collections.abc import Mapping
+from itertools import product
 
+import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
@@ -45,15 +47,21 @@ def make_segmenter(
     scenario: Scenario, demonstrations: DemonstrationSet | None = None
 ) -> GeometricSegmenter:
     """The geometric segmenter as the scenario sets it, whatever the source of its labels is."""
-    seen = demonstrations.demonstrations if demonstrations is not None else ()
-    examples = [
-        observation.points
-        for demonstration in seen
-        for observation in demonstration.observations.values()
-        if observation.role == "target" and observation.frame == "W"
-    ]
+    targets: list[np.ndarray] = []
+    pairs: list[tuple[np.ndarray, np.ndarray]] = []
+    for demonstration in demonstrations.demonstrations if demonstrations is not None else ():
+        standing: dict[str, list[np.ndarray]] = {"target": [], "grasped": []}
+        for observation in demonstration.observations.values():
+            if observation.frame == "W" and observation.role in standing:
+                standing[observation.role].append(observation.points)
+        targets += standing["target"]
+        pairs += product(standing["grasped"], standing["target"])
     return GeometricSegmenter(
-        make_panda_self_filter(), scenario.segmentation, scenario.fusion, examples=examples
+        make_panda_self_filter(),
+        scenario.segmentation,
+        scenario.fusion,
+        examples=targets,
+        pairs=pairs,
     )
 
 

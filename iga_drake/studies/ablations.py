@@ -24,12 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from iga_drake.aligners.iga.aligner import (
-    IgaAligner,
-    IgaConfig,
-    default_energy,
-    default_weights,
-)
+from iga_drake.aligners.iga.aligner import IgaAligner, IgaConfig
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
 from iga_drake.aligners.iga.energy import EnergyConfig, PairEnergyNet, minimise, pair_proposals
 from iga_drake.aligners.iga.local_encoder import load_encoder
@@ -43,7 +38,7 @@ from iga_drake.errors import IgaDrakeError, kept_on_interrupt
 from iga_drake.evaluation.results import ResultsStore, code_key, results_kept
 from iga_drake.files import output_folder, write_text
 from iga_drake.geometry.se3 import rigid
-from iga_drake.paths import models_dir
+from iga_drake.paths import landed_weights
 from iga_drake.training.correspondence import DescriptorTraining
 from iga_drake.training.descriptor import train_descriptor, validate
 from iga_drake.training.energy import VALIDATION as ENERGY_SET
@@ -280,9 +275,9 @@ class Ablations:
     # Time for the training of a group's default, which sets the steps of the whole group (min).
     minutes_each: float = 10.0
     count: int = 100  # samples (or problems) that errors are measured on
-    weights: Path = field(default_factory=default_weights)
-    energy: Path = field(default_factory=default_energy)
-    encoder: Path = field(default_factory=lambda: models_dir() / "weights" / "encoder.safetensors")
+    weights: Path = field(default_factory=lambda: landed_weights(DESCRIPTOR))
+    energy: Path = field(default_factory=lambda: landed_weights(ENERGY))
+    encoder: Path = field(default_factory=lambda: landed_weights("encoder"))
     problems: Path | None = None  # folder; default: one in `folder`
     workers: int = 0
     device: str = "cpu"

@@ -17,8 +17,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
-from iga_drake.aligners.iga.aligner import default_weights
-from iga_drake.aligners.iga.weights import load_descriptor
+from iga_drake.aligners.iga.weights import DESCRIPTOR, load_descriptor
 from iga_drake.aligners.iga_paper.aligner import (
     IgaPaperAligner,
     IgaPaperConfig,
@@ -47,6 +46,7 @@ from iga_drake.evaluation.results import (
     results_kept,
 )
 from iga_drake.files import output_file, write_text
+from iga_drake.paths import landed_weights
 from iga_drake.progress import progress
 from iga_drake.training.correspondence import LOSS_FIELDS, DescriptorTraining, descriptor_loss
 from iga_drake.training.paper import (
@@ -196,9 +196,9 @@ def trained(name: str, weights: Path | None, *, particles: int, steps: int) -> T
         options = {"weights": weights} if weights else {}
         return Trained(name, str(weights or ""), make_aligner(name, **options), 0, 0.0, 0.0)
     if name in DESCRIPTORS:
-        path = weights or default_weights()
+        path = weights or landed_weights(DESCRIPTOR)
         aligner = make_aligner(name, weights=path)
-        _, card = load_checkpoint(path, kind="descriptor")
+        _, card = load_checkpoint(path, kind=DESCRIPTOR)
         flops = descriptor_flops(path) * card["samples_seen"]
         return Trained(
             name, str(path), aligner, card["samples_seen"], flops, float(card["seconds"])

@@ -15,9 +15,10 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from iga_drake.files import output_folder
+from iga_drake.paths import landed_weights
 from iga_drake.progress import progress
 from iga_drake.shapes.deformers import LatticeDeformer, PartDeformer, ReinstancingDeformer
-from iga_drake.shapes.deformers.dif_net import DifNetDeformer, default_dif_net_weights
+from iga_drake.shapes.deformers.dif_net import DifNetDeformer
 from iga_drake.shapes.deformers.protocol import DeformableShape, Deformer
 from iga_drake.shapes.dif_net import DifNet, Normalisation, load_dif_net
 from iga_drake.shapes.errors import ShapeError
@@ -222,7 +223,7 @@ def add_evaluate_deformations(parser: argparse.ArgumentParser) -> None:
 
 def evaluate_deformations(arguments: argparse.Namespace) -> int:
     """Prints the errors of DIF-Net's correspondence and how many deformed meshes are valid."""
-    net, card = load_dif_net(arguments.weights or default_dif_net_weights())
+    net, card = load_dif_net(arguments.weights or landed_weights("dif_net"))
     config = DifNetTraining(**card["training"])
     print(f"correspondence, {correspondence_errors(net, config, pairs=arguments.pairs).row()}")
     names = arguments.family or ["mug", "bottle", "hammer"]

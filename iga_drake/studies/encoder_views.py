@@ -19,7 +19,7 @@ from iga_drake.dataset.occupancy import OccupancyConfig, OccupancySample, make_o
 from iga_drake.dataset.splits import sample_set
 from iga_drake.files import output_file
 from iga_drake.geometry.clouds import furthest_point_sampling
-from iga_drake.paths import models_dir
+from iga_drake.paths import landed_weights
 from iga_drake.progress import progress
 from iga_drake.viewing.dataset_views import MOST_ROWS, ViewError, balls
 
@@ -127,7 +127,7 @@ def view_reconstruction(arguments: argparse.Namespace) -> int:
         )
     from iga_drake.viewing.shape_sheets import write_png
 
-    weights = arguments.weights or models_dir() / "weights" / "encoder.safetensors"
+    weights = arguments.weights or landed_weights("encoder")
     net, _ = load_encoder(weights)
     indices = list(range(first, first + count))
     write_png(reconstruction_sheet(net, arguments.split, indices, centres=K), arguments.png)

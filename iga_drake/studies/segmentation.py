@@ -1,7 +1,7 @@
 """`iga evaluate segmentation`: the geometric segmenter's labels beside the true ones.
 
-Every scene of a task is looked at twice where the task shows what the hand holds: with the arm as
-it starts, and in the posture in which the object is shown. A point is a pixel with a depth.
+Every scene of a task is looked at twice where the hand holds an object from the start: with the arm
+as it starts, and in the posture in which the object is shown. A point is a pixel with a depth.
 """
 
 import argparse
@@ -32,7 +32,16 @@ from iga_drake.tasks.registry import scenario_task
 from iga_drake.viewing.figures import figure_file, new_figure, write_figure
 
 _COUNTED = {"target": Role.TARGET, "grasped": Role.GRASPED}
-_TASKS = ("grasp", "stack", "sweep", "hang", "insert", "pour")
+_TASKS = (
+    "grasp",
+    "stack",
+    "sweep",
+    "hang",
+    "insert",
+    "pour",
+    "pick_and_insert",
+    "pick_and_stack",
+)
 _COLORS = {Role.TARGET: (0.95, 0.55, 0.1), Role.GRASPED: (0.15, 0.55, 0.95),
            Role.ROBOT: (0.25, 0.75, 0.3)}  # fmt: skip
 
@@ -113,7 +122,7 @@ def render_views(scenario: Scenario, seed: int) -> Iterator[RenderedViews]:
     X_WE = panda.X_WE(state)
     postures = [np.asarray(scene.panda_position, dtype=float)]
     shown = [plan.present for plan in task.motion.observations if plan.present is not None]
-    if shown:
+    if shown and scene.truth.X_EO:  # the hand holds it at the start
         robot = make_panda_planning_robot(scenario.table, scenario.planning)
         solver = PoseSolver(robot, config=scenario.planning)
         found = solver.solve(shown[0], near=postures[0])
@@ -208,18 +217,18 @@ def _draw(rendered: RenderedViews, found: SegmentedViews, path: Path) -> None:
 def result_table(results: Sequence[SegmentationResult]) -> str:
     """The results as text."""
     lines = [
-        f"{'task':<8}{'role':<9}{'looks':>6}{'refused':>9}{'points':>10}{'precision':>11}"
+        f"{'task':<16}{'role':<9}{'looks':>6}{'refused':>9}{'points':>10}{'precision':>11}"
         f"{'recall':>8}{'IoU':>8}"
     ]
     for result in results:
         for name, c in result.roles.items():
             if c.true or c.labelled:
                 lines.append(
-                    f"{result.task:<8}{name:<9}{c.looks:>6}{c.refused:>9}{c.true:>10}"
+                    f"{result.task:<16}{name:<9}{c.looks:>6}{c.refused:>9}{c.true:>10}"
                     f"{c.precision:>11.4f}{c.recall:>8.4f}{c.overlap:>8.4f}"
                 )
         lines.append(
-            f"{result.task:<8}robot taken for an object: {result.robot_as_object} points; "
+            f"{result.task:<16}robot taken for an object: {result.robot_as_object} points; "
             f"{statistics.median(result.milliseconds):.0f} ms (median) for the labels of a look"
         )
     return "\n".join([*lines, *(reason for each in results for reason in each.problems)])

@@ -83,9 +83,12 @@ class SegmentationConfig:
     # Corners of the rectangle in x and y of W (m) in which the target's middle is expected.
     region_lower: list[float] = field(default_factory=lambda: [0.2, -0.5])
     region_upper: list[float] = field(default_factory=lambda: [0.85, 0.5])
-    # Greatest difference in shape (`ShapeLikeness`) between the target and the demonstrations'
-    # targets, as a share of their size; and how many times as different the next likely object has
-    # to be. Without demonstrations: how many times as large the largest object has to be.
+    # The same for an object that the hand takes from the table.
+    grasped_region_lower: list[float] = field(default_factory=lambda: [0.2, -0.5])
+    grasped_region_upper: list[float] = field(default_factory=lambda: [0.85, 0.5])
+    # Greatest difference in shape (`ShapeLikeness`) from the demonstrations' objects, as a share of
+    # their size; and how many times as different the next likely object, or pair, has to be.
+    # Without demonstrations: how many times as large the largest object has to be.
     largest_difference: float = 0.3
     distinctness: float = 2.0
 
@@ -107,17 +110,25 @@ class SegmentationConfig:
                 "hand_reach": (1e-3, 0.5),
                 "region_lower": (-10.0, 10.0),
                 "region_upper": (-10.0, 10.0),
+                "grasped_region_lower": (-10.0, 10.0),
+                "grasped_region_upper": (-10.0, 10.0),
                 "largest_difference": (1e-3, 100.0),
                 "distinctness": (1.0, 100.0),
             },
         )
-        lower, upper = self.region_lower, self.region_upper
-        ordered = len(lower) == len(upper) == 2 and all(
-            low < up for low, up in zip(lower, upper, strict=True)
-        )
-        check_range(
-            ordered, f"{where}.region_lower", lower, f"2 numbers below region_upper = {upper}"
-        )
+        for prefix, lower, upper in (
+            ("", self.region_lower, self.region_upper),
+            ("grasped_", self.grasped_region_lower, self.grasped_region_upper),
+        ):
+            ordered = len(lower) == len(upper) == 2 and all(
+                low < up for low, up in zip(lower, upper, strict=True)
+            )
+            check_range(
+                ordered,
+                f"{where}.{prefix}region_lower",
+                lower,
+                f"2 numbers below {prefix}region_upper = {upper}",
+            )
 
 
 class TablePlane(NamedTuple):
@@ -191,18 +202,24 @@ class ShapeLikeness:
     between any two of its points (after the shape distribution D2 of Osada et al., Shape
     Distributions, 2002), as quantiles of its projections on several directions (sliced Wasserstein
     distance, Bonneel et al. 2015), and by that of the points' heights. Products of one kind differ
-    most in size: clouds are compared at the best of several scales, which counts a little.
+    most in size: clouds are compared at the best of several scales, which counts a little. Objects
+    that were seen together are compared at one scale: which is the larger one, tells them apart.
     """
 
-    def __init__(self, examples: Sequence[np.ndarray], table_height: float = 0.0) -> None:
-        """`examples`: clouds (P, 3) (m, in W) of objects that stand on a table."""
+    def __init__(self, examples: Sequence[Sequence[np.ndarray]], table_height: float = 0.0) -> None:
+        """`examples`: of each, the clouds (P, 3) (m, in W) of objects that stand on a table, always
+        as many and in the same order."""
         self._table_height = table_height
-        self._examples = [self._describe(points) for points in examples if len(points) > 1]
+        self._examples = [
+            [self.describe(points) for points in clouds]
+            for clouds in examples
+            if min(len(points) for points in clouds) > 1
+        ]
 
     def __bool__(self) -> bool:
         return bool(self._examples)
 
-    def _describe(self, points: np.ndarray) -> np.ndarray:
+    def describe(self, points: np.ndarray) -> np.ndarray:
         """Quantiles (m) of the distances' projections and of the heights: (6, 20)."""
         grid = voxelize(points, 0.005).centroids.astype(float)
         some = grid[np.linspace(0, len(grid) - 1, min(len(grid), _SAMPLES)).astype(int)]
@@ -213,13 +230,19 @@ class ShapeLikeness:
         rows = [np.cos(angle) * across + np.sin(angle) * along for angle in _DIRECTIONS]
         return np.stack([np.quantile(row, _QUANTILES) for row in (*rows, heights)])
 
-    def difference(self, points: np.ndarray) -> float:
-        """How different a cloud (P, 3) is from the likest example, as a share of that one's size; 0
-        where there are none."""
-        own = self._describe(points)
+    def difference(self, own: Sequence[np.ndarray]) -> float:
+        """How different objects, as `describe` describes them, are from the likest example, as a
+        share of its objects' sizes (the mean); 0 where there are no examples."""
         return min(
             (
-                float(np.abs(scale * own - example).mean() / np.abs(example).mean())
+                float(
+                    np.mean(
+                        [
+                            np.abs(scale * mine - other).mean() / np.abs(other).mean()
+                            for mine, other in zip(own, example, strict=True)
+                        ]
+                    )
+                )
                 + _SCALE_COUNTS * abs(float(np.log(scale)))
                 for example in self._examples
                 for scale in _SCALES
@@ -238,6 +261,8 @@ class GeometricSegmenter:
     5. The target stands on the table, in the region where it is expected. If there are several, it
        is the one likest in shape to the demonstrations' targets (`ShapeLikeness`), without these
        the largest; where two could be it, none is.
+    6. Where the demonstrations show the grasped object on the table, nothing is held and there are
+       several objects, the likest pair of them is grasped object and target.
     """
 
     def __init__(
@@ -247,12 +272,14 @@ class GeometricSegmenter:
         fusion: FusionConfig | None = None,
         *,
         examples: Sequence[np.ndarray] = (),
+        pairs: Sequence[tuple[np.ndarray, np.ndarray]] = (),
     ) -> None:
         """
         Args:
           self_filter: the robot's shape.
           fusion: crop box, voxels, and what a jump in depth is.
           examples: clouds (P, 3) (m, in W) of the target in the demonstrations.
+          pairs: clouds of the grasped object, where it stood on the table, and of the target.
 
         Raises `ConfigError`.
         """
@@ -260,7 +287,9 @@ class GeometricSegmenter:
         self._config = config or SegmentationConfig()
         self._fusion = fusion or FusionConfig()
         self._config.check("SegmentationConfig")
-        self._likeness = ShapeLikeness(examples, self._config.table_height)
+        height = self._config.table_height
+        self._target_likeness = ShapeLikeness([(points,) for points in examples], height)
+        self._pair_likeness = ShapeLikeness(pairs, height)
         self._corner = np.array(self._fusion.crop_lower[:2])
         extent = np.array(self._fusion.crop_upper[:2]) - self._corner
         self._shape = tuple(int(n) for n in np.ceil(extent / _CELL).astype(int) + 1)
@@ -302,8 +331,7 @@ class GeometricSegmenter:
         sound = [seen[name].points[:, rows[seen[name].sound[rows]]] for name, rows in rest.items()]
         joined = np.hstack(sound) if sound else np.zeros((3, 0), np.float32)
         if joined.shape[1] == 0:
-            nowhere = np.zeros(0, int)
-            roles = _Roles(np.zeros((0, 3)), np.zeros(0, np.int16), nowhere, self._nothing())
+            roles = _Roles(np.zeros((0, 3)), np.zeros(0, np.int16), {}, self._nothing())
         else:
             centroids = voxelize(joined.T, self._fusion.voxel_size).centroids.astype(float)
             X_WE = self._filter.pose(position, opening)
@@ -317,8 +345,9 @@ class GeometricSegmenter:
             distance, nearest = tree.query(points, distance_upper_bound=self._config.gap)
             found = np.isfinite(distance)
             label.reshape(-1)[above.pixels[rows[found]]] = roles.roles[nearest[found]]
-            thin = np.isin(above.low_cells, roles.target_cells)
-            label.reshape(-1)[above.low_pixels[thin]] = Role.TARGET
+            for role, cells in roles.thin_cells.items():
+                thin = np.isin(above.low_cells, cells)
+                label.reshape(-1)[above.low_pixels[thin]] = role
             for role in (Role.TARGET, Role.GRASPED):
                 _close(label, role, above.free)
         return SegmentedViews(labels, {**roles.problems, **problems})
@@ -450,24 +479,29 @@ class GeometricSegmenter:
                 "what lies between the pads also stands on the table: whether the hand holds it "
                 "can't be told before it is lifted"
             )
-        found = self._target(centroids, whole, np.flatnonzero(stands), heights)
-        cells = np.zeros(0, int)
-        if isinstance(found, str):
-            problems["target"] = found
+        objects = self._standing(centroids, whole, np.flatnonzero(stands), heights)
+        found: _Found
+        if self._pair_likeness and len(objects) > 1 and "grasped" in problems:
+            found = self._pair(objects)
         else:
-            problems.pop("target")
-            roles[whole == found.group] = Role.TARGET
-            cells = found.cells
-        return _Roles(centroids, roles, cells, problems)
+            found = self._target(objects)
+        thin_cells = {}
+        for role, name in ((Role.GRASPED, "grasped"), (Role.TARGET, "target")):
+            each = found.get(name)
+            if isinstance(each, str):
+                problems[name] = each
+            elif each is not None:
+                problems.pop(name, None)
+                roles[whole == each.group] = role
+                thin_cells[role] = each.cells
+        return _Roles(centroids, roles, thin_cells, problems)
 
-    def _target(
+    def _standing(
         self, centroids: np.ndarray, whole: np.ndarray, groups: np.ndarray, heights: np.ndarray
-    ) -> "_Candidate | str":
-        """Which of the groups that stand on the table is the target; or why none is, in words."""
+    ) -> "list[_Candidate]":
+        """The objects among the groups that stand on the table."""
         config = self._config
-        lower, upper = np.array(config.region_lower), np.array(config.region_upper)
         objects: list[_Candidate] = []
-        outside = 0
         for number in groups:
             points = centroids[whole == number]
             if len(points) < config.minimum_voxels:
@@ -482,66 +516,128 @@ class GeometricSegmenter:
             )
             points = np.concatenate([points, thin])
             middle = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
-            if not ((middle > lower) & (middle < upper)).all():
-                outside += 1
-                continue
-            difference = self._likeness.difference(points)
-            objects.append(_Candidate(difference, len(points), int(number), middle, cells))
-        if not objects:
-            if not outside:
-                return self._nothing()["target"]
-            return (
-                f"what stands on the table ({outside} objects) lies outside "
-                f"segmentation.region_lower to region_upper, {config.region_lower} to "
-                f"{config.region_upper} m"
-            )
-        objects.sort(key=lambda each: (each.difference, -each.voxels, each.group))
-        first = objects[0]
-        if first.difference > config.largest_difference:
-            return (
-                f"none of {len(objects)} objects on the table looks like the demonstrations' "
-                f"target: the likest differs by {100 * first.difference:.0f} %, at most "
-                f"{100 * config.largest_difference:.0f} % are allowed "
-                "(segmentation.largest_difference)"
-            )
-        if len(objects) > 1:
-            second = objects[1]
-            if self._likeness:
-                alike = second.difference < config.distinctness * first.difference
+            shape = self._target_likeness.describe(points)
+            objects.append(_Candidate(shape, len(points), int(number), middle, cells))
+        return objects
+
+    def _targets(self, objects: "Sequence[_Candidate]") -> "list[_Candidate] | str":
+        """Those of the objects that stand where the target is expected; or why there is none."""
+        lower, upper = self._config.region_lower, self._config.region_upper
+        inside = [each for each in objects if each.within(lower, upper)]
+        if inside or not objects:
+            return inside or self._nothing()["target"]
+        return (
+            f"what stands on the table ({len(objects)} objects) lies outside "
+            f"segmentation.region_lower to region_upper, {lower} to {upper} m"
+        )
+
+    def _target(self, objects: "Sequence[_Candidate]") -> "_Found":
+        """Which of the objects is the target."""
+        config = self._config
+        targets = self._targets(objects)
+        if isinstance(targets, str):
+            return {"target": targets}
+        unlike = self._target_likeness.difference
+        difference = {each.group: unlike([each.shape]) for each in targets}
+        targets.sort(key=lambda each: (difference[each.group], -each.voxels, each.group))
+        first = targets[0]
+        if difference[first.group] > config.largest_difference:
+            return {"target": self._unlike(len(targets), "target", difference[first.group])}
+        if len(targets) > 1:
+            second = targets[1]
+            one, other = difference[first.group], difference[second.group]
+            if self._target_likeness:
+                alike = other < config.distinctness * one
                 measure = (
-                    f"differ by {100 * first.difference:.0f} % and "
-                    f"{100 * second.difference:.0f} % from the demonstrations' target in shape"
+                    f"differ by {100 * one:.0f} % and {100 * other:.0f} % from the demonstrations' "
+                    "target in shape"
                 )
             else:
                 alike = first.voxels < config.distinctness * second.voxels
                 measure = f"have {first.voxels} and {second.voxels} voxels"
             if alike:
-                places = [np.round(each.middle, 2).tolist() for each in (first, second)]
-                return (
-                    f"two objects on the table, at {places[0]} and {places[1]} m, could be it: "
-                    f"they {measure}; take one away or narrow segmentation.region_lower to "
-                    "region_upper"
-                )
-        return first
+                return {
+                    "target": f"two objects on the table, at {first.place} and {second.place} m, "
+                    f"could be it: they {measure}; take one away or narrow "
+                    "segmentation.region_lower to region_upper"
+                }
+        return {"target": first}
+
+    def _pair(self, objects: "Sequence[_Candidate]") -> "_Found":
+        """Which two of the objects are the one to grasp and the target."""
+        config = self._config
+        targets = self._targets(objects)
+        if isinstance(targets, str):
+            return {"target": targets}
+        lower, upper = config.grasped_region_lower, config.grasped_region_upper
+        inside = [each for each in objects if each.within(lower, upper)]
+        pairs = [(one, other) for one in inside for other in targets if one is not other]
+        if not pairs:
+            reason = (
+                f"no two of {len(objects)} objects on the table stand in "
+                f"segmentation.grasped_region_lower to grasped_region_upper, {lower} to {upper} m, "
+                f"and in region_lower to region_upper, {config.region_lower} to "
+                f"{config.region_upper} m"
+            )
+            return {"grasped": reason, "target": reason}
+        difference = [self._pair_likeness.difference([a.shape, b.shape]) for a, b in pairs]
+        first, *others = np.argsort(difference, kind="stable")
+        if difference[first] > config.largest_difference:
+            reason = self._unlike(len(objects), "grasped object and target", difference[first])
+            return {"grasped": reason, "target": reason}
+        grasped, target = pairs[first]
+        if others and difference[others[0]] < config.distinctness * difference[first]:
+            other = pairs[others[0]]
+            reason = (
+                f"the object to grasp and the target could be those on the table at "
+                f"{grasped.place} and {target.place} m, or those at {other[0].place} and "
+                f"{other[1].place} m: in shape they differ by {100 * difference[first]:.0f} % and "
+                f"{100 * difference[others[0]]:.0f} % from the demonstrations'; narrow "
+                "segmentation.grasped_region_lower to grasped_region_upper or region_lower to "
+                "region_upper"
+            )
+            return {"grasped": reason, "target": reason}
+        return {"grasped": grasped, "target": target}
+
+    def _unlike(self, count: int, what: str, difference: float) -> str:
+        return (
+            f"none of {count} objects on the table looks like the demonstrations' {what}: the "
+            f"likest differs by {100 * difference:.0f} %, at most "
+            f"{100 * self._config.largest_difference:.0f} % are allowed "
+            "(segmentation.largest_difference)"
+        )
 
 
 class _Candidate(NamedTuple):
     """An object that stands on the table."""
 
-    difference: float  # from the demonstrations' targets (`ShapeLikeness`)
+    shape: np.ndarray  # `ShapeLikeness.describe`
     voxels: int
     group: int
     middle: np.ndarray  # (2,) of its outline in W (m)
     cells: np.ndarray  # the cells of its thin parts
 
+    def within(self, lower: Sequence[float], upper: Sequence[float]) -> bool:
+        """Whether its middle is in a rectangle in x and y of W (m)."""
+        return bool(((self.middle > lower) & (self.middle < upper)).all())
+
+    @property
+    def place(self) -> list[float]:
+        """Its middle, rounded, for messages."""
+        return np.round(self.middle, 2).tolist()
+
+
+# The object of a role on the table, or why there is none, in words.
+_Found = dict[str, _Candidate | str]
+
 
 class _Roles(NamedTuple):
-    """Roles (K,) int16 of voxels (K, 3) (m), the cells at the table that are the target's, and what
+    """Roles (K,) int16 of voxels (K, 3) (m), the cells at the table that are each role's, and what
     stands against a role, in words."""
 
     centroids: np.ndarray
     roles: np.ndarray
-    target_cells: np.ndarray
+    thin_cells: dict[Role, np.ndarray]
     problems: dict[str, str]
 
 

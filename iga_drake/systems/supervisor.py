@@ -43,6 +43,9 @@ class SupervisorConfig:
     hand_age: float = 0.5
     # Largest age (s) of a camera's last image while the arm moves; null: not checked.
     camera_age: float | None = None
+    # How much wider (m) than commanded the hand is where it holds something: a hand that held and
+    # then closes to less has lost it; null: not checked.
+    grip_margin: float | None = None
     # How far (s) the diagram may lag behind the arm's clock while commands change.
     lateness: float = 0.05
 
@@ -63,7 +66,11 @@ class SupervisorConfig:
                 "lateness": (1e-3, 60.0),
             },
         )
-        for name, bounds in (("acceleration_scale", (1e-3, 1.0)), ("camera_age", (1e-3, 60.0))):
+        for name, bounds in (
+            ("acceleration_scale", (1e-3, 1.0)),
+            ("camera_age", (1e-3, 60.0)),
+            ("grip_margin", (1e-4, 0.05)),
+        ):
             if getattr(self, name) is not None:
                 check_bounds(self, where, {name: bounds})
         lower, upper = self.workspace_lower, self.workspace_upper
@@ -76,6 +83,49 @@ class SupervisorConfig:
         check_range(one_each, f"{where}.torque_limit", torque, f"{joints} numbers, one a joint")
 
 
+# s for which the fingers stay where they are before they are taken to hold: after they closed, and
+# at the start, where they may not have begun to do as commanded.
+_GRIP_TIME, _GRIP_START_TIME = 0.3, 1.0
+_GRIP_STILL = 5e-4  # m
+_GRIP_CLOSED = 1e-3  # m: fingers that haven't moved by as much haven't begun to close
+
+
+@dataclass(frozen=True)
+class Grip:
+    """What the hand's openings (m) tell of whether it holds something."""
+
+    # Commanded opening, and the measured one when it was last changed; None at the start, where
+    # what is held was grasped before.
+    commanded: float
+    before: float | None = None
+    # Where the fingers have been since (s), to within what counts as still.
+    opening: float = float("nan")
+    since: float = 0.0
+    # The opening at which something is held; None where nothing is.
+    held: float | None = None
+    # Whether what was held is lost: the fingers closed on.
+    lost: bool = False
+
+    def after(self, now: float, commanded: float, measured: float, margin: float) -> "Grip":
+        """The grip at `now` (s), with the hand commanded and measured so; `margin` (m) is
+        `SupervisorConfig.grip_margin`."""
+        grip = self
+        if commanded != grip.commanded:
+            opens = commanded > grip.commanded
+            # Fingers that tighten their grip still hold; those that open let go.
+            held = None if opens else grip.held
+            grip = replace(grip, commanded=commanded, before=measured, held=held)
+        if grip.held is not None:
+            return replace(grip, opening=measured, lost=measured - commanded < margin)
+        if not abs(measured - grip.opening) <= _GRIP_STILL:
+            grip = replace(grip, opening=measured, since=now)
+        closed = grip.before is None or measured < grip.before - _GRIP_CLOSED
+        still = _GRIP_START_TIME if grip.before is None else _GRIP_TIME
+        if closed and measured - commanded >= margin and now - grip.since >= still:
+            grip = replace(grip, held=measured)
+        return grip
+
+
 @dataclass(frozen=True)
 class _Memory:
     """The supervisor's abstract state: the last good command, overload and status."""
@@ -83,6 +133,7 @@ class _Memory:
     position: np.ndarray | None = None  # last command that was good
     velocity: np.ndarray | None = None  # of the last commands (rad/s)
     time_overloaded: float | None = None  # since when the torque is too high (s)
+    grip: Grip | None = None
     status: SupervisorStatus = field(default_factory=SupervisorStatus)
 
     def __deepcopy__(self, memo: dict) -> "_Memory":
@@ -104,6 +155,8 @@ class Supervisor(LeafSystem):
         - arm_time (optional)
         - hand_time (optional)
         - mode (optional)
+        - opening_commanded (optional)
+        - opening_measured (optional)
         - CAMERA.time for each camera
         output_ports:
         - position
@@ -112,7 +165,8 @@ class Supervisor(LeafSystem):
     - `position_commanded` (N, rad), `position_measured` (N, rad), `velocity_measured` (N, rad/s),
       `torque_external` (N, N m).
     - `arm_time`, `hand_time`, `CAMERA.time` (1, s): when arm and hand were measured and the images
-      taken, on the diagram's clock. `mode` (1): an `ArmMode`. What isn't connected isn't checked.
+      taken, on the diagram's clock. `mode` (1): an `ArmMode`. `opening_commanded`,
+      `opening_measured` (1, m): of the hand. What isn't connected isn't checked.
     - `position` (N, rad): the command let through. Before the first check it is the command itself
       if that is finite, else the measured position.
     - `status` (SupervisorStatus): whether it holds, and the reason.
@@ -120,8 +174,9 @@ class Supervisor(LeafSystem):
     Checked each time step: the arm's mode; the age of what is measured; values that aren't finite;
     the command's joint limits, its change since the last one (velocity and acceleration) and its
     distance to the measured angles; the measured velocity; the commanded position of E against a
-    box; external torque; and, while commands change, whether the diagram keeps up with the arm's
-    clock and the cameras deliver. Holding is latched: it ends with a new context.
+    box; external torque; whether the hand has lost what it held; and, while commands change,
+    whether the diagram keeps up with the arm's clock and the cameras deliver. Holding is
+    latched: it ends with a new context.
     """
 
     def __init__(
@@ -147,6 +202,9 @@ class Supervisor(LeafSystem):
         self._arm_time_input = self.DeclareVectorInputPort("arm_time", 1)
         self._hand_time_input = self.DeclareVectorInputPort("hand_time", 1)
         self._mode_input = self.DeclareVectorInputPort("mode", 1)
+        self._opening_inputs = [
+            self.DeclareVectorInputPort(f"opening_{name}", 1) for name in ("commanded", "measured")
+        ]
         self._camera_inputs = {
             name: self.DeclareVectorInputPort(f"{name}.time", 1) for name in cameras
         }
@@ -192,6 +250,19 @@ class Supervisor(LeafSystem):
                 torque=torque,
                 overload_time=0.0 if overloaded is None else context.get_time() - overloaded,
             )
+        grip = self._find_grip(context, memory.grip)
+        if not reason and grip is not None and grip.lost and grip.held is not None:
+            held, opening, commanded = (
+                f"{100 * value:.1f} cm" for value in (grip.held, grip.opening, grip.commanded)
+            )
+            cause, reason = (
+                Cause.CONTACT,
+                (
+                    f"the hand has lost what it held: its fingers closed from {held} to {opening}, "
+                    f"{commanded} are commanded; take it away or lay it back, and begin anew"
+                ),
+            )
+        memory = replace(memory, grip=grip)
         if reason:
             memory = replace(memory, position=last, status=SupervisorStatus(True, reason, cause))
         else:
@@ -232,6 +303,14 @@ class Supervisor(LeafSystem):
                         f"{config.camera_age:g} s allowed: look at its driver and its cable"
                     )
         return Cause.IK, ""
+
+    def _find_grip(self, context: Context, before: Grip | None) -> Grip | None:
+        margin = self._config.grip_margin
+        commanded, measured = (self._read(context, port) for port in self._opening_inputs)
+        if margin is None or commanded is None or measured is None:
+            return None
+        now = context.get_time()
+        return (before or Grip(commanded)).after(now, commanded, measured, margin)
 
     def _read(self, context: Context, port: InputPort) -> float | None:
         return float(port.Eval(context)[0]) if port.HasValue(context) else None

@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ from iga_drake.tasks.holding import (
     holding_scene,
 )
 from iga_drake.tasks.placement import CLEARANCE, WorkArea
-from iga_drake.tasks.predicates import AllOf, Predicate, WindowPredicate
+from iga_drake.tasks.predicates import AllOf, CountOf, Predicate, WindowPredicate
 from iga_drake.tasks.snapshots import ROBOT, TABLE, Snapshot, TaskError
 from iga_drake.tasks.task import Split, Task
 
@@ -292,7 +293,9 @@ class DeclaredTask(Task):
             raise TaskError(f"task.declared.success: {error}") from error
 
     def _windows(self) -> list[WindowPredicate]:
-        return [p for p in self._goal.predicates if isinstance(p, WindowPredicate)]
+        stated = self._goal.predicates
+        each = [p.predicates if isinstance(p, CountOf) else (p,) for p in stated]
+        return [p for p in chain.from_iterable(each) if isinstance(p, WindowPredicate)]
 
     # Expert and goal
 
@@ -421,12 +424,35 @@ def _three(values: list[float]) -> tuple[float, float, float]:
     return (x, y, z)
 
 
-def _predicate(
-    where: str, entry: Mapping[str, Options], declaration: TaskDeclaration
-) -> WindowPredicate:
-    ((name, options),) = entry.items()
+def _predicate(where: str, entry: Mapping[str, Options], declaration: TaskDeclaration) -> Predicate:
+    """One entry of `success`; of several objects, that it holds of `at_least` so many."""
+    ((name, given),) = entry.items()
     if name not in _PREDICATES:
         raise TaskError(f"{where}: '{name}' is no predicate: one of {', '.join(_PREDICATES)}")
+    options = dict(given)
+    objects = [part.strip() for part in str(options.get("object", "")).split(",")]
+    count = options.pop("at_least", None)
+    if count is None and len(objects) == 1:
+        return _window_predicate(where, name, options, declaration)
+    if not isinstance(count, (int, type(None))) or isinstance(count, bool):
+        raise TaskError(f"{where}.{name}.at_least: {count!r} found, a whole number expected")
+    each = [
+        _window_predicate(where, name, {**options, "object": item}, declaration) for item in objects
+    ]
+    try:
+        return CountOf(
+            predicates=tuple(each),
+            at_least=len(each) if count is None else count,
+            name=str(options.get("name", "")),
+            otherwise=str(options.get("otherwise", "")),
+        )
+    except TaskError as error:
+        raise TaskError(f"{where}.{name}: {error}") from error
+
+
+def _window_predicate(
+    where: str, name: str, options: Mapping[str, Any], declaration: TaskDeclaration
+) -> WindowPredicate:
     kind = _PREDICATES[name]
     known = {item.name: item for item in dataclasses.fields(kind)}
     values: dict[str, Any] = {}

@@ -1,6 +1,7 @@
 """Grasp: take a pan by its handle and lift it."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -32,6 +33,7 @@ LIFT = 0.18  # m, what the policy lifts after closing the hand
 LIFTED = 0.10  # m, what counts
 HOLD = 1.0  # s
 SLIP = 0.01  # m
+PICK_FORCE = 15.0  # N; the hand closes where a finger meets something
 # The reach is the handle's middle's: there the hand takes it from above.
 _WORK_AREA = WorkArea(lower=(0.35, -0.3), upper=(0.65, 0.3), reach=(0.33, 0.68))
 _COLORS = ((0.18, 0.19, 0.2), (0.62, 0.16, 0.13), (0.55, 0.57, 0.6), (0.16, 0.3, 0.45))
@@ -116,6 +118,38 @@ class Grasp(Task):
                 Upright(object=TARGET, tilt=np.pi),
             )
         )
+
+
+def pick_first(motion: TaskMotion, *, held: str, target: str, lift: float) -> TaskMotion:
+    """The motion of a task that begins with an object in the hand, for one in which that object
+    stands on the table: it is picked up by `Grasp`'s waypoint, and all else is observed after that.
+
+    Args:
+      held: what the object is called; once more observed it is "... in the hand".
+      target: what the other object is called.
+      lift: m, of the object before it is observed again.
+    """
+    plans = {plan.role: plan for plan in motion.observations}
+    (grasp,) = Grasp.motion.waypoints
+    in_hand = f"{held} in the hand"
+    return TaskMotion(
+        observations=(
+            ObservationPlan(name="gripper", role="gripper", frame="E"),
+            ObservationPlan(name=held, role="grasped", frame="W", upright=True),
+            replace(plans["grasped"], name=in_hand, after=1),
+            replace(plans["target"], name=target, after=1),
+        ),
+        waypoints=(
+            replace(
+                grasp,
+                name="pick",
+                target=held,
+                contact_force=PICK_FORCE,
+                after_W=(0.0, 0.0, lift),
+            ),
+            *(replace(each, grasped=in_hand, target=target) for each in motion.waypoints),
+        ),
+    )
 
 
 TASKS = {Grasp.name: Grasp}

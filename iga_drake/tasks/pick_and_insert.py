@@ -1,7 +1,6 @@
 """Pick and insert: take a bottle from the table by its cap and put it into a shoe."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -9,11 +8,10 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
-from iga_drake.policy.motion import ObservationPlan, TaskMotion
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
-from iga_drake.tasks.grasp import Grasp
+from iga_drake.tasks.grasp import Grasp, pick_first
 from iga_drake.tasks.holding import wrist_turn
 from iga_drake.tasks.insert import HELD, TARGET, Insert, cap_grip
 from iga_drake.tasks.placement import WorkArea
@@ -21,7 +19,6 @@ from iga_drake.tasks.predicates import Predicate
 from iga_drake.tasks.task import Split, Task
 
 LIFT = 0.22  # m, more than the shoe is high
-CONTACT_FORCE = 15.0  # N; the hand closes where a finger meets something
 _GRIP_DEPTH = 0.010  # m from the bottle's top to the middle of the pads
 _ROOM = 0.09  # m from the bottle's axis to the shoe: an open finger goes down there
 _SHOE_AREA = WorkArea(lower=(0.4, -0.3), upper=(0.66, 0.3), reach=(0.42, 0.64))
@@ -31,7 +28,6 @@ _COLORS = ((0.2, 0.45, 0.3), (0.25, 0.4, 0.62), (0.7, 0.35, 0.15), (0.5, 0.5, 0.
 _LEATHERS = ((0.36, 0.22, 0.14), (0.16, 0.16, 0.17), (0.72, 0.7, 0.66), (0.45, 0.18, 0.16))
 (_GRASP,) = Grasp.motion.waypoints
 _INSERT = Insert()
-(_HELD_PLAN,) = (plan for plan in _INSERT.motion.observations if plan.role == "grasped")
 
 
 class PickAndInsert(Task):
@@ -44,27 +40,7 @@ class PickAndInsert(Task):
         "test": tuple(range(1201, 1211)),
     }
     observe_posture = _INSERT.observe_posture
-    motion = TaskMotion(
-        observations=(
-            ObservationPlan(name="gripper", role="gripper", frame="E"),
-            ObservationPlan(name="bottle", role="grasped", frame="W", upright=True),
-            replace(_HELD_PLAN, name="bottle in the hand", after=1),
-            ObservationPlan(name="shoe", role="target", frame="W", upright=True, after=1),
-        ),
-        waypoints=(
-            replace(
-                _GRASP,
-                name="pick",
-                target="bottle",
-                contact_force=CONTACT_FORCE,
-                after_W=(0.0, 0.0, LIFT),
-            ),
-            *(
-                replace(waypoint, grasped="bottle in the hand")
-                for waypoint in _INSERT.motion.waypoints
-            ),
-        ),
-    )
+    motion = pick_first(_INSERT.motion, held="bottle", target="shoe", lift=LIFT)
 
     @staticmethod
     def make_shapes(seed: int) -> Mapping[str, ShapeInstance]:

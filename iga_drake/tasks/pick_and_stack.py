@@ -1,7 +1,6 @@
 """Pick and stack: take a bowl from the table by its rim and put it into another one."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -9,12 +8,11 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
 from iga_drake.demonstrations.demonstration import HAND_OPENING_MAX
-from iga_drake.policy.motion import ObservationPlan, TaskMotion
 from iga_drake.shapes.families import bowl
 from iga_drake.shapes.instance import ShapeInstance
 from iga_drake.shapes.sdf import write_sdf
 from iga_drake.station.simulated.scene import Scene, SceneObject, SceneTruth
-from iga_drake.tasks.grasp import Grasp
+from iga_drake.tasks.grasp import pick_first
 from iga_drake.tasks.placement import WorkArea
 from iga_drake.tasks.predicates import AllOf, CarriedStill, Predicate
 from iga_drake.tasks.stack import HELD, TARGET, WORK_AREA, Stack, grip, nesting_bowls
@@ -24,16 +22,12 @@ from iga_drake.tasks.task import Split, Task
 # when it is lifted, and is seen again after that.
 SLIP = 0.04
 LIFT = 0.2  # m, more than the other bowl is high
-CONTACT_FORCE = 15.0  # N; the hand closes where a finger meets the bowl
 _GRIP_DEPTH = 0.010  # m from the rim to the middle of the pads: as much above it as below is left
 _ASIDE = 0.12  # m, least distance of the lower bowl from the robot's plane of symmetry
 _HAND = 0.12  # m between the two rims: half the hand goes down there
 _UPPER_AREA = WorkArea(lower=(0.42, -0.3), upper=(0.65, 0.3), reach=(0.55, 0.68))
 _COLORS = ((0.85, 0.83, 0.76), (0.2, 0.42, 0.6), (0.72, 0.35, 0.24), (0.35, 0.55, 0.4))
-(_GRASP,) = Grasp.motion.waypoints
 _STACK = Stack()
-(_PUT,) = _STACK.motion.waypoints
-(_HELD_PLAN,) = (plan for plan in _STACK.motion.observations if plan.role == "grasped")
 
 
 class PickAndStack(Task):
@@ -46,24 +40,7 @@ class PickAndStack(Task):
         "test": tuple(range(1001, 1011)),
     }
     observe_posture = _STACK.observe_posture
-    motion = TaskMotion(
-        observations=(
-            ObservationPlan(name="gripper", role="gripper", frame="E"),
-            ObservationPlan(name="upper bowl", role="grasped", frame="W", upright=True),
-            replace(_HELD_PLAN, name="upper bowl in the hand", after=1),
-            ObservationPlan(name="lower bowl", role="target", frame="W", upright=True, after=1),
-        ),
-        waypoints=(
-            replace(
-                _GRASP,
-                name="pick",
-                target="upper bowl",
-                contact_force=CONTACT_FORCE,
-                after_W=(0.0, 0.0, LIFT),
-            ),
-            replace(_PUT, grasped="upper bowl in the hand", target="lower bowl"),
-        ),
-    )
+    motion = pick_first(_STACK.motion, held="upper bowl", target="lower bowl", lift=LIFT)
 
     @staticmethod
     def make_shapes(seed: int) -> Mapping[str, ShapeInstance]:

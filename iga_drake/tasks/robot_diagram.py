@@ -16,13 +16,14 @@ from iga_drake.demonstrations.demonstration import DemonstrationSet
 from iga_drake.planning.inverse_kinematics import PoseSolver
 from iga_drake.policy.iga_policy import IgaPolicy
 from iga_drake.policy.inference import Inference
-from iga_drake.policy.machine import PolicyMachine
+from iga_drake.policy.machine import OnRobot, PolicyMachine
 from iga_drake.policy.motion import TaskMotion
 from iga_drake.station.cameras.rgbd import camera_info
 from iga_drake.station.log.recorder import EpisodeRecorder, add_recorder
 from iga_drake.station.log.writer import EpisodeLogWriter
 from iga_drake.station.panda.model import gripper_cloud
 from iga_drake.station.panda.planning import make_panda_planning_robot
+from iga_drake.station.panda.self_filter import make_panda_self_filter
 from iga_drake.station.perception import add_fusion
 from iga_drake.station.scenario import Scenario
 from iga_drake.systems.differential_ik import DifferentialIk
@@ -33,6 +34,7 @@ from iga_drake.systems.supervisor import Supervisor
 from iga_drake.systems.waypoint_follower import WaypointFollower
 from iga_drake.viewing.policy_views import add_policy_views
 
+_ON_ROBOT = 0.003  # m from the robot's shapes: what a depth camera is off at its surface
 # Every wire of the robot but the cameras': "system.port" of the source -> those of
 # the sinks. The station's own ports have names with a dot as well: the system is the first part.
 WIRES: Mapping[str, tuple[str, ...]] = {
@@ -52,6 +54,7 @@ WIRES: Mapping[str, tuple[str, ...]] = {
     "station.panda.time": ("supervisor.arm_time",),
     "station.hand.time": ("supervisor.hand_time",),
     "station.panda.mode": ("supervisor.mode",),
+    "station.hand.opening_measured": ("supervisor.opening_measured",),
     "fusion.target_cloud": ("policy.target_cloud",),
     "fusion.grasped_cloud": ("policy.grasped_cloud",),
     "fusion.camera_counts": ("policy.camera_counts",),
@@ -62,7 +65,7 @@ WIRES: Mapping[str, tuple[str, ...]] = {
     "follower.status": ("policy.follower.status",),
     "follower.desired_pose": ("differential_ik.desired_pose",),
     "follower.nominal_posture": ("differential_ik.nominal_posture",),
-    "follower.hand.opening": ("station.hand.opening",),
+    "follower.hand.opening": ("station.hand.opening", "supervisor.opening_commanded"),
     "differential_ik.position": ("supervisor.position_commanded",),
     "supervisor.position": ("station.panda.position",),
     "supervisor.status": ("policy.supervisor.status",),
@@ -126,6 +129,7 @@ def build_robot_diagram(
                 np.array(scenario.supervisor.workspace_lower),
                 np.array(scenario.supervisor.workspace_upper),
             ),
+            on_robot=_on_robot(),
             seed=seed + scenario.seeds.aligner,
         )
     )
@@ -157,6 +161,16 @@ def build_robot_diagram(
     diagram = builder.Build()
     diagram.set_name("robot")
     return RobotDiagram(diagram=diagram, station=station, fusion=fusion, policy=policy)
+
+
+def _on_robot() -> OnRobot:
+    """Tells which points lie on the Panda."""
+    own = make_panda_self_filter()
+
+    def on_robot(points: np.ndarray, position: np.ndarray, opening: float) -> np.ndarray:
+        return own.near(points.T, position, opening, margin=_ON_ROBOT)
+
+    return on_robot
 
 
 def _add_views(

@@ -27,7 +27,7 @@ from iga_drake.training.correspondence import (
     descriptor_loss,
 )
 from iga_drake.training.run import RunOptions, SavedState, TrainingRun
-from iga_drake.training.settings import TrainingError, replaced
+from iga_drake.training.settings import check_same_model, replaced
 from iga_drake.training.validation import alignment_errors
 
 TRAINING_SAMPLES = SampleConfig(field=0.6)
@@ -131,11 +131,7 @@ def train_descriptor(
     saved = SavedState.read(output, KIND) if resume else None
     if saved is not None:
         before = _saved_settings(saved, output)
-        if model not in (None, before.model):
-            raise TrainingError(
-                f"{output / 'state.safetensors'}: has another model than the one asked for "
-                f"({before.model}): train in another folder"
-            )
+        check_same_model(output, model, before.model)
         model, config, samples = before.model, config or before.training, samples or before.samples
     model, config = model or DescriptorConfig(), config or DescriptorTraining()
     samples = samples or TRAINING_SAMPLES

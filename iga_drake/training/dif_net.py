@@ -24,7 +24,7 @@ from iga_drake.shapes.dif_net import (
 from iga_drake.shapes.errors import ShapeError
 from iga_drake.shapes.families import FAMILIES
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
-from iga_drake.training.settings import TrainingError, replaced
+from iga_drake.training.settings import check_same_model, replaced
 
 
 @dataclass(frozen=True)
@@ -268,19 +268,15 @@ def train_dif_net(
     """
     saved = SavedState.read(output, KIND)
     before = DifNetSettings.of(output)
-    state_path = output / "state.safetensors"
-    if saved is not None and model not in (None, before.model):
-        raise TrainingError(
-            f"{state_path}: has another model than the one asked for ({before.model}): train in "
-            "another folder"
-        )
+    if saved is not None:
+        check_same_model(output, model, before.model)
     model, config = model or before.model, config or before.training
     shapes = training_shapes(config)
     digest = shapes_digest(shapes)
     if saved is not None and saved.card["shapes_digest"] != digest:
         raise ShapeError(
-            f"{state_path}: family '{config.family}' makes other shapes now than when this "
-            "training began: train anew in another folder"
+            f"{output / 'state.safetensors'}: family '{config.family}' makes other shapes now than "
+            "when this training began: train anew in another folder"
         )
     torch.manual_seed(config.seed)
     net = DifNet(model, config.shapes).to(device)

@@ -26,7 +26,7 @@ from iga_drake.dataset.occupancy import OccupancyConfig, make_occupancy_sample
 from iga_drake.geometry.clouds import furthest_point_sampling
 from iga_drake.precision import mixed_precision
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
-from iga_drake.training.settings import TrainingError, replaced
+from iga_drake.training.settings import TrainingError, check_same_model, replaced
 
 SEED_STRIDE = 10_000_000  # samples between the streams of two seeds
 
@@ -228,12 +228,9 @@ def train_encoder(
     """
     saved = SavedState.read(output, ENCODER)
     before = EncoderSettings.of(output)
-    for given, own in ((encoder, before.encoder), (decoder, before.decoder)):
-        if saved is not None and given not in (None, own):
-            raise TrainingError(
-                f"{output / 'state.safetensors'}: has another model than the one asked for "
-                f"({own}): train in another folder"
-            )
+    if saved is not None:
+        check_same_model(output, encoder, before.encoder)
+        check_same_model(output, decoder, before.decoder)
     encoder, decoder = encoder or before.encoder, decoder or before.decoder
     config, samples = config or before.training, samples or before.samples
     torch.manual_seed(config.seed)

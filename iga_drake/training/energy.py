@@ -14,14 +14,12 @@ import copy
 import dataclasses
 import math
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from iga_drake.aligners.iga.aligner import default_weights
 from iga_drake.aligners.iga.energy import (
     Energy,
     EnergyConfig,
@@ -30,8 +28,11 @@ from iga_drake.aligners.iga.energy import (
     SearchConfig,
     minimise,
 )
+from iga_drake.aligners.iga.weights import DESCRIPTOR
 from iga_drake.aligners.iga.weights import ENERGY as KIND
+from iga_drake.checkpoint import file_digest
 from iga_drake.geometry.se3 import geodesic_angle, random_rotations, rigid, transform
+from iga_drake.paths import landed_weights
 from iga_drake.training.energy_problems import (
     ProblemMaker,
     Problems,
@@ -40,7 +41,7 @@ from iga_drake.training.energy_problems import (
     random_near,
 )
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
-from iga_drake.training.settings import TrainingError, replaced
+from iga_drake.training.settings import check_same_model, replaced
 
 NEAR, VOTE_NEAR, FAR = 0.03, 0.05, 0.04  # m
 ONE, MODES, VALIDATION = "train_energy", "train_energy_modes", "validation_energy"
@@ -252,14 +253,10 @@ def train_energy(
     saved = SavedState.read(output, KIND)
     if saved is not None:
         before = EnergySettings.of(output)
-        if model not in (None, before.model):
-            raise TrainingError(
-                f"{output / 'state.safetensors'}: has another model than the one asked for "
-                f"({before.model}): train in another folder"
-            )
+        check_same_model(output, model, before.model)
         model, config = before.model, config or before.training
     model, config = model or EnergyConfig(), config or EnergyTraining()
-    maker = ProblemMaker(Path(descriptor or default_weights()), model)
+    maker = ProblemMaker(Path(descriptor or landed_weights(DESCRIPTOR)), model)
     folder = problems or output / "problems"
     sets = [
         make_problems(folder, split, count, maker, workers=workers).to(device)
@@ -287,7 +284,7 @@ def train_energy(
         saved=saved,
         card={
             "model": dataclasses.asdict(model),
-            "descriptor": sha256(maker.descriptor.read_bytes()).hexdigest()[:16],
+            "descriptor": file_digest(maker.descriptor),
         },
         options=options,
         validate=validate,

@@ -19,14 +19,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from iga_drake.aligners.iga.aligner import Explanation, IgaAligner, default_weights
+from iga_drake.aligners.iga.aligner import Explanation, IgaAligner
 from iga_drake.aligners.iga.familiarity import FamiliarityNet
+from iga_drake.aligners.iga.weights import DESCRIPTOR
 from iga_drake.aligners.iga.weights import FAMILIARITY as KIND
 from iga_drake.aligners.query import Query, sample_query
 from iga_drake.checkpoint import file_digest, save_checkpoint
 from iga_drake.dataset.alignment_error import CONFIG, equivalents, nearest_error
 from iga_drake.dataset.foreign import FOREIGN_KINDS, foreign_pair
 from iga_drake.dataset.samples import Sample, make_sample
+from iga_drake.paths import landed_weights
 from iga_drake.progress import progress
 from iga_drake.training.settings import TrainingError
 
@@ -217,7 +219,7 @@ def train_familiarity(
     """Fits the familiarity to descriptors (default: the landed ones) and writes it to `output` /
     familiarity.safetensors. Returns its card. Raises `IgaDrakeError`."""
     config = config or FamiliarityTraining()
-    path = Path(descriptor or default_weights())
+    path = Path(descriptor or landed_weights(DESCRIPTOR))
     indices = range(config.first, config.first + config.samples)
     net = FamiliarityNet()
     bare = IgaAligner(weights=path, familiarity=net)

@@ -43,10 +43,10 @@ from iga_drake.dataset.loader import Batch, collate, sample_loader
 from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.dataset.splits import sample_sets
 from iga_drake.geometry.se3 import geodesic_angle, kabsch, rigid, so3_exp
-from iga_drake.paths import models_dir
+from iga_drake.paths import landed_weights
 from iga_drake.precision import mixed_precision
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
-from iga_drake.training.settings import TrainingError, replaced
+from iga_drake.training.settings import TrainingError, check_same_model, replaced
 
 SEED_STRIDE = 10_000_000  # samples between the streams of two seeds
 FRAMES = ("own", "common")
@@ -492,13 +492,8 @@ def _generator(config: PaperTraining, number: int, device: torch.device | str) -
     return torch.Generator(device).manual_seed(seed)
 
 
-def default_encoder() -> Path:
-    """The landed checkpoint of the local encoder."""
-    return models_dir() / "weights" / "encoder.safetensors"
-
-
 def _new_model(part: str, config: GraphConfig, encoder: Path | None) -> PaperModel:
-    trained: LocalEncoder = load_encoder(encoder or default_encoder())[0].encoder
+    trained: LocalEncoder = load_encoder(encoder or landed_weights("encoder"))[0].encoder
     model = PaperModel(part, config, trained.config)
     model.encoder.load_state_dict(trained.state_dict())
     return model
@@ -529,11 +524,7 @@ def train_paper(
     saved = SavedState.read(output, kind_of(part))
     if saved is not None:
         before = _saved_settings(saved, output, part)
-        if model not in (None, before.model):
-            raise TrainingError(
-                f"{output / 'state.safetensors'}: has another model than the one asked for "
-                f"({before.model}): train in another folder"
-            )
+        check_same_model(output, model, before.model)
         model, config, samples = before.model, config or before.training, samples or before.samples
     model = model or default_model(part)
     config, samples = config or PaperTraining(), samples or SampleConfig()

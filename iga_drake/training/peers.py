@@ -13,10 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from iga_drake.aligners.protocol import Aligner
+from iga_drake.aligners.peers.aligner import PeerAligner
 from iga_drake.dataset.loader import Batch, sample_loader
+from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.training.run import RunConfig, RunOptions, SavedState, Term, TrainingRun
-from iga_drake.training.settings import TrainingError, replaced
+from iga_drake.training.settings import TrainingError, check_same_model, replaced
 from iga_drake.training.validation import alignment_errors
 
 SEED_STRIDE = 10_000_000  # samples between the streams of two seeds
@@ -45,17 +46,24 @@ class PeerTraining(RunConfig):
 class Peer:
     """One of the peers, for training."""
 
-    name: str  # of the aligner, the command and the checkpoints
+    aligner: type[PeerAligner]
     help: str
-    model: Any  # sizes by default
     training: PeerTraining  # settings by default
-    samples: Any  # likewise
-    make: Callable[[str, int, Any], Any]  # sample by set, index and `samples`
-    network: Callable[[Any], nn.Module]  # from the sizes
     # Loss of a batch under settings, with draws of the generator.
     loss: Callable[[nn.Module, Batch, Any, torch.Generator], Term]
-    aligner: Callable[[nn.Module], Aligner]
+    samples: Any = field(default_factory=SampleConfig)  # settings by default
+    make: Callable[[str, int, Any], Any] = make_sample  # sample by set, index and `samples`
     rate_factors: Mapping[str, float] = field(default_factory=dict)  # as of `TrainingRun`
+
+    @property
+    def name(self) -> str:
+        """Of the aligner, the command and the checkpoints."""
+        return self.aligner.name
+
+    @property
+    def model(self) -> Any:
+        """Sizes by default."""
+        return self.aligner.sizes()
 
 
 @dataclass(frozen=True)
@@ -130,16 +138,13 @@ def train_peer(
     before = PeerSettings.of(output, peer)
     settings = settings or before
     model, config, samples = settings.model, settings.training, settings.samples
-    if saved is not None and model != before.model:
-        raise TrainingError(
-            f"{output / 'state.safetensors'}: has another model than the one asked for "
-            f"({before.model}): train in another folder"
-        )
+    if saved is not None:
+        check_same_model(output, model, before.model)
     torch.manual_seed(config.seed)
-    net = peer.network(model).to(device)
+    net = peer.aligner.network(model).to(device)
 
     def validate(weights: dict[str, Tensor]) -> dict[str, float]:
-        measured = peer.network(model)
+        measured = peer.aligner.network(model)
         measured.load_state_dict(weights, strict=False)
         return alignment_errors(peer.aligner(measured.eval()), count=config.validation_samples)
 

@@ -9,14 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from iga_drake.aligners.peers.reldist import (
-    RELDIST,
-    RelDistAligner,
-    RelDistConfig,
-    RelDistNet,
-)
+from iga_drake.aligners.peers.reldist import RelDistAligner
 from iga_drake.dataset.loader import Batch
-from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.geometry.clouds import furthest_point_sampling
 from iga_drake.geometry.se3 import geodesic_angle, transform
 from iga_drake.training.peers import Peer, PeerTraining, drawn_pairs
@@ -90,14 +84,9 @@ def reldist_loss(
 
 
 PEER = Peer(
-    name=RELDIST,
+    aligner=RelDistAligner,
     help="RelDist-DC, distances between the objects' parts",
-    model=RelDistConfig(),
     training=RelDistTraining(),
-    samples=SampleConfig(),
-    make=make_sample,
-    network=RelDistNet,
     loss=reldist_loss,
-    aligner=RelDistAligner,  # type: ignore[arg-type]
     rate_factors={"features.log_temperature": 5.0},
 )

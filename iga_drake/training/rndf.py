@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from iga_drake.aligners.peers.rndf import RNDF, UNIT, DescriptorField, RndfAligner, RndfConfig
+from iga_drake.aligners.peers.rndf import UNIT, DescriptorField, RndfAligner
 from iga_drake.dataset.loader import Batch
 from iga_drake.dataset.occupancy import OccupancyConfig, make_occupancy_sample
 from iga_drake.training.peers import Peer, PeerTraining
@@ -43,13 +43,10 @@ def rndf_loss(
 
 
 PEER = Peer(
-    name=RNDF,
+    aligner=RndfAligner,
     help="R-NDF, a descriptor field trained by occupancy",
-    model=RndfConfig(),
     training=RndfTraining(),
+    loss=rndf_loss,
     samples=OccupancyConfig(),
     make=make_occupancy_sample,
-    network=DescriptorField,
-    loss=rndf_loss,
-    aligner=RndfAligner,  # type: ignore[arg-type]
 )

@@ -18,6 +18,16 @@ class TrainingError(IgaDrakeError):
     """A training can't run as asked: bad settings, a state that doesn't fit, something missing."""
 
 
+def check_same_model(folder: Path, asked: Any, own: Any) -> None:
+    """Raises `TrainingError` where another model is asked for than the run in this folder has; None
+    asks for that one."""
+    if asked not in (None, own):
+        raise TrainingError(
+            f"{folder / 'state.safetensors'}: has another model than the one asked for ({own}): "
+            "train in another folder"
+        )
+
+
 def replaced(settings: Settings, values: Mapping[str, Any], where: str) -> Settings:
     """`settings` (a dataclass) with some fields replaced, lists as tuples.
 

@@ -5,16 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from iga_drake.aligners.peers.taxpose import (
-    TAXPOSE,
-    UNIT,
-    OwnFrames,
-    TaxPoseAligner,
-    TaxPoseConfig,
-    TaxPoseNet,
-)
+from iga_drake.aligners.peers.taxpose import UNIT, OwnFrames, TaxPoseAligner, TaxPoseNet
 from iga_drake.dataset.loader import Batch
-from iga_drake.dataset.samples import SampleConfig, make_sample
 from iga_drake.geometry.clouds import furthest_point_sampling, own_frames
 from iga_drake.geometry.se3 import geodesic_angle, inverse, rigid, transform
 from iga_drake.training.peers import Peer, PeerTraining, drawn_pairs
@@ -71,13 +63,8 @@ def taxpose_loss(
 
 
 PEER = Peer(
-    name=TAXPOSE,
+    aligner=TaxPoseAligner,
     help="TAX-Pose-DC, soft correspondences told by the mean demonstration",
-    model=TaxPoseConfig(),
     training=TaxPoseTraining(),
-    samples=SampleConfig(),
-    make=make_sample,
-    network=TaxPoseNet,
     loss=taxpose_loss,
-    aligner=TaxPoseAligner,  # type: ignore[arg-type]
 )

@@ -1,6 +1,7 @@
 """The Panda's driver between a bus and an arm that does what it is told."""
 
 import sys
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -239,6 +240,8 @@ class SlowHand:
 
     def move(self, opening: float) -> None:
         self.did.append(("move", opening))
+        if opening < self.width:  # there is something in the way
+            raise DriverError("not reached")
         for _ in range(200):
             if self.stopped:
                 return
@@ -263,7 +266,7 @@ def test_the_hand_moves_grasps_and_is_told_once():
         lcm.Publish(messages.HAND_COMMAND_CHANNEL, b"foreign")
         bridge.step(0)
     bridge._motion.join()
-    assert hand.did == [("move", 0.08), ("grasp", 0.0, 15.0)]
+    assert hand.did == [("move", 0.08), ("move", 0.0), ("grasp", 0.0, 15.0)]
     assert hand.stopped and said == ["hand: nothing between the fingers"]
     lcm.HandleSubscriptions(0)
     status = lcmt_schunk_wsg_status.decode(statuses[-1])
@@ -280,3 +283,141 @@ def test_options_are_checked_before_anything_moves(capsys):
     for option, value in (("--speed", "3"), ("--lcm-url", "memq://"), ("--step", "9")):
         assert cli.main(["drive", "panda", "--ip", "127.0.0.1", option, value]) == cli.BAD_INPUT
         assert option.lstrip("-").replace("-", "_") in capsys.readouterr().err.replace("-", "_")
+
+
+def test_a_hand_that_waits_keeps_no_other_thread_waiting():
+    """The arm's part of the driver runs beside it."""
+    hand = SlowHand()
+    bridge = HandBridge(hand, DrakeLcm("memq://"), clock=lambda: NOW)
+    beside = threading.Thread(target=lambda: bridge.step(1000), daemon=True)
+    beside.start()
+    turns = 0
+    while beside.is_alive():
+        time.sleep(0.01)
+        turns += 1
+    assert turns > 5  # of a second; with Drake's own wait there would be one
+
+
+def test_a_hand_that_closes_to_a_width_is_not_told_to_grasp():
+    lcm, hand = DrakeLcm("memq://"), SlowHand()
+    hand.width, hand.stopped = 0.08, True
+
+    def move(opening: float) -> None:
+        hand.did.append(("move", opening))
+        hand.width = opening
+
+    hand.move = move
+    bridge = HandBridge(hand, lcm, clock=lambda: NOW)
+    command = messages.hand_command(0.05, force=15.0, utime=utime_of(NOW))
+    lcm.Publish(messages.HAND_COMMAND_CHANNEL, command.encode())
+    bridge.step(0)
+    bridge._motion.join()
+    assert hand.did == [("move", 0.05)]
+
+
+def junk(rng: np.random.Generator, good: bytes) -> bytes:
+    """What no driver sends: noise, torn and changed messages, those of another type."""
+    kind = rng.integers(5)
+    if kind == 0:
+        return rng.bytes(rng.integers(400))
+    if kind == 1:
+        return good[: rng.integers(len(good))]
+    if kind == 2:
+        return good + rng.bytes(8)
+    if kind == 3:
+        return messages.hand_status(0.04, utime=utime_of(NOW)).encode()
+    return good[:8] + rng.bytes(len(good) - 8)  # the type's own mark, then noise
+
+
+def test_a_minute_of_foreign_messages_changes_nothing():
+    drive, rng = Drive(), np.random.default_rng(0)
+    for k in range(12_000):
+        target = HOME + 0.1 * np.sin(0.001 * k)
+        message = messages.arm_command(target, mode="position", utime=utime_of(drive.now))
+        data = message.encode()
+        drive.lcm.Publish(messages.COMMAND_CHANNEL, junk(rng, data))
+        drive.lcm.Publish(messages.HAND_COMMAND_CHANNEL, junk(rng, data))
+        drive.lcm.Publish(messages.COMMAND_CHANNEL, data)
+        drive.step()
+    np.testing.assert_allclose(drive.arm.target, target)
+    assert drive.mode is ArmMode.READY and not drive.bridge.fault
+
+
+def test_noise_in_a_whole_message_moves_nothing():
+    """With the type's own mark and length, and whatever else: it is dropped or a fault."""
+    rng = np.random.default_rng(1)
+    for _ in range(300):
+        drive = Drive()
+        drive.send(HOME + 0.01)
+        good = messages.arm_command(HOME, mode="position", utime=utime_of(drive.now)).encode()
+        drive.lcm.Publish(messages.COMMAND_CHANNEL, good[:20] + rng.bytes(len(good) - 20))
+        drive.step()
+        np.testing.assert_allclose(drive.arm.target, HOME + 0.01)
+
+
+@pytest.mark.parametrize("jump", [-3600.0, 3600.0])
+def test_a_clock_that_jumps_stops_and_starts_commands_without_a_jump(jump: float):
+    drive = Drive()
+    for k in range(10):
+        drive.send(HOME + 0.001 * k)
+    drive.now += jump
+    drive.send(HOME + 0.011, late=jump)  # the other machine's clock has not jumped yet
+    np.testing.assert_allclose(drive.arm.target, HOME + 0.009)
+    assert "off this machine's clock" in drive.said[-1]
+    drive.send(HOME + 0.05)  # it has; meanwhile the trajectory went on
+    np.testing.assert_allclose(drive.arm.target, HOME + 0.009)
+    assert "begin where the arm is" in drive.said[-1]
+    drive.send(HOME + 0.012)
+    np.testing.assert_allclose(drive.arm.target, HOME + 0.012)
+    assert drive.mode is ArmMode.READY
+
+
+@pytest.mark.parametrize("jump", [-3600.0, 3600.0])
+def test_recovery_goes_on_after_a_clock_that_jumped(jump: float):
+    drive = Drive(recover=True)
+    for _ in range(2):
+        drive.arm.reflex()
+        drive.step(300)
+        assert drive.mode is ArmMode.READY
+        drive.now += jump
+    assert drive.arm.recovered == 2
+
+
+class BrokenArm(ObedientArm):
+    def state(self) -> ArmState:
+        raise DriverError("connection reset")
+
+
+def test_a_link_that_broke_is_made_again_and_nothing_jumps():
+    arms: list[ObedientArm] = []
+
+    def reconnect() -> ObedientArm:
+        if not arms:
+            raise DriverError("connection refused")
+        return arms.pop()
+
+    drive = Drive(reconnect=reconnect)
+    drive.send(HOME + 0.01)
+    drive.bridge._arm = BrokenArm()
+    told = len(drive.statuses)
+    for _ in range(500):
+        drive.send(HOME + 0.02)
+    drive.lcm.HandleSubscriptions(0)
+    assert len(drive.statuses) <= told + 1  # the one that was under way
+    assert 1 < len(drive.said) < 10, drive.said
+    fresh = ObedientArm()
+    fresh.target = HOME + 0.01
+    arms.append(fresh)
+    for _ in range(500):
+        drive.send(HOME + 0.1)
+    assert drive.mode is ArmMode.READY and fresh.running
+    np.testing.assert_allclose(fresh.target, HOME + 0.01)
+    drive.send(HOME + 0.02)
+    np.testing.assert_allclose(fresh.target, HOME + 0.02)
+
+
+def test_without_a_way_back_a_broken_link_ends_the_driver():
+    drive = Drive()
+    drive.bridge._arm = BrokenArm()
+    with pytest.raises(DriverError, match="connection reset"):
+        drive.step()

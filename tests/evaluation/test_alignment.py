@@ -9,8 +9,6 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from iga_drake import cli
-from iga_drake.aligners.iga.aligner import default_weights
-from iga_drake.aligners.peers.networks import landed_weights
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.checkpoint import load_checkpoint
 from iga_drake.dataset.alignment_error import (
@@ -31,6 +29,7 @@ from iga_drake.evaluation.alignment import (
     own_objects,
 )
 from iga_drake.evaluation.results import ResultsStore
+from iga_drake.paths import landed_weights
 from iga_drake.shapes.families import FAMILIES
 
 
@@ -223,8 +222,8 @@ def test_bad_arguments_are_refused() -> None:
 
 def test_the_model_card_tells_what_the_file_says() -> None:
     row, _ = evaluate_alignment(_Fixed(np.eye(4)), "validation", 1)
-    _, card = load_checkpoint(default_weights(), kind="descriptor")
-    text = model_card(default_weights(), [row])
+    _, card = load_checkpoint(landed_weights("descriptor"), kind="descriptor")
+    text = model_card(landed_weights("descriptor"), [row])
     assert f"{card['samples_seen']:,} samples" in text
     assert row.rows() in text and "learning_rate" in text
 

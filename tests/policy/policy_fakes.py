@@ -140,6 +140,7 @@ def make_machine(
     seed=0,
     upright=(True,),
     workspace=None,
+    on_robot=None,
     **config,
 ):
     demonstrations = make_demonstrations(motion, upright=upright)
@@ -151,5 +152,6 @@ def make_machine(
         solve=solve or (lambda X_WE, near: near),
         config=PolicyConfig(period=0.1, **{"observe_limit": 10.0, **config}),
         workspace=workspace,
+        on_robot=on_robot,
         seed=seed,
     )

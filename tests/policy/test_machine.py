@@ -213,6 +213,24 @@ def test_bad_observations_are_refused_and_the_arm_held(changes, reason):
     assert list(targets) == [0], "no motion was ever asked for"
 
 
+@pytest.mark.parametrize(("share", "refused"), [(0.0, False), (0.25, False), (0.4, True)])
+def test_a_mask_with_the_robot_in_it_is_refused(share: float, refused: bool):
+    asked = []
+
+    def on_robot(points, position, opening):
+        asked.append((points, position, opening))
+        return np.arange(len(points)) < share * len(points)
+
+    inputs = FakeInputs()
+    memory, targets = run(make_machine(on_robot=on_robot), inputs)
+    np.testing.assert_array_equal(asked[0][0], TARGET)
+    np.testing.assert_array_equal(asked[0][1], inputs.position())
+    assert memory.status.phase is (Phase.REFUSED if refused else Phase.DONE)
+    if refused:
+        assert memory.status.cause is Cause.PERCEPTION and list(targets) == [0]
+        assert "40 % of the points of 'pan' lie on the robot" in memory.status.reason
+
+
 def test_what_it_waits_for_is_told_at_once():
     inputs = FakeInputs(clouds={"target": np.zeros((0, 3))}, lost="nothing is labelled")
     machine = make_machine()

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from torch.func import jacrev, vmap
 
 from iga_drake.checkpoint import CheckpointError, save_checkpoint
-from iga_drake.shapes.deformers.dif_net import DifNetDeformer, default_dif_net_weights
+from iga_drake.paths import landed_weights
+from iga_drake.shapes.deformers.dif_net import DifNetDeformer
 from iga_drake.shapes.deformers.protocol import DeformableShape, PointDeformer
 from iga_drake.shapes.dif_net import (
     KIND,
@@ -212,7 +213,7 @@ def test_weights_are_read_back_and_wrong_ones_refused(tmp_path: Path) -> None:
 
 def test_the_packages_weights_deform_a_ball_smoothly_and_each_seed_otherwise() -> None:
     """Of shapes that are no chairs: volumes stay positive, nothing folds, instances differ."""
-    assert default_dif_net_weights().is_file()
+    assert landed_weights("dif_net").is_file()
     surface = ellipsoid((0.05, 0.05, 0.1))
     turned = surface.vertices @ Rotation.from_euler("y", 0.4).as_matrix().T
     shape = DeformableShape(turned, surface.faces)

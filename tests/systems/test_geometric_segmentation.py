@@ -98,7 +98,18 @@ def hand_boxes(at=AT):
     return [(Role.ROBOT, np.array(centre) + at, size) for centre, size in HAND]
 
 
-def segment(gantry, boxes, *, at=AT, cameras=CAMERAS, examples=(), noise=0.0, table=0.0, **options):
+def segment(
+    gantry,
+    boxes,
+    *,
+    at=AT,
+    cameras=CAMERAS,
+    examples=(),
+    pairs=(),
+    noise=0.0,
+    table=0.0,
+    **options,
+):
     """The result, and true and found roles (P,) of all pixels."""
     rng = np.random.default_rng(0)
     images = {name: render(boxes, X_WC, table) for name, X_WC in cameras.items()}
@@ -108,7 +119,8 @@ def segment(gantry, boxes, *, at=AT, cameras=CAMERAS, examples=(), noise=0.0, ta
         )
         for name, (depth, _) in images.items()
     }
-    segmenter = GeometricSegmenter(gantry, SegmentationConfig(**options), examples=examples)
+    config = SegmentationConfig(**options)
+    segmenter = GeometricSegmenter(gantry, config, examples=examples, pairs=pairs)
     found = segmenter.segment(views, at, OPENING)
     truth = np.concatenate([role.ravel() for _, role in images.values()])
     label = np.concatenate([found.labels[name].ravel() for name in images])
@@ -225,6 +237,66 @@ def test_nothing_of_the_demonstrated_shape_is_refused(gantry):
     assert not (label == TARGET).any()
 
 
+FAR = AT + [0.0, 0.35, 0.2]
+BOX = ((0.45, -0.2, 0.03), (0.20, 0.14, 0.06))
+SEEN_TOGETHER = (surface((0.3, 0.3, 0.045), (0.09, 0.08, 0.09)), surface(*BOX))
+
+
+def test_what_is_grasped_from_the_table_is_told_from_the_target(gantry):
+    crate = ((0.72, 0.0, 0.02), (0.05, 0.3, 0.04))
+    boxes = [(GRASPED, *CUP), (TARGET, *BOX), (BACKGROUND, *crate), *hand_boxes(FAR)]
+    found, truth, label = segment(
+        gantry, boxes, at=FAR, examples=SEEN_TOGETHER[1:], pairs=[SEEN_TOGETHER]
+    )
+    assert found.problems == {}
+    for role in (TARGET, GRASPED):
+        precision, recall = shares(truth, label, role)
+        assert precision > 0.99
+        assert recall > 0.85
+    # In the hand it isn't looked for on the table.
+    boxes = [(GRASPED, *HELD), (TARGET, *BOX), *hand_boxes()]
+    found, truth, label = segment(gantry, boxes, examples=SEEN_TOGETHER[1:], pairs=[SEEN_TOGETHER])
+    assert found.problems == {}
+    assert min(shares(truth, label, GRASPED)) > 0.6
+    assert min(shares(truth, label, TARGET)) > 0.85
+
+
+def test_size_beside_each_other_tells_objects_of_one_shape_apart(gantry):
+    small, large = ((0.5, 0.2, 0.03), (0.06,) * 3), ((0.5, -0.2, 0.05), (0.10,) * 3)
+    pair = (surface((0.3, 0.3, 0.04), (0.08,) * 3), surface((0.6, 0.0, 0.065), (0.13,) * 3))
+    for one, other, seen in ((small, large, pair), (large, small, pair[::-1])):
+        boxes = [(GRASPED, *one), (TARGET, *other), *hand_boxes(FAR)]
+        found, truth, label = segment(gantry, boxes, at=FAR, examples=pair[1:], pairs=[seen])
+        assert found.problems == {}
+        assert min(*shares(truth, label, GRASPED), *shares(truth, label, TARGET)) > 0.8
+
+
+def test_of_two_equal_objects_a_region_says_which_is_grasped(gantry):
+    one, other = CUP, ((0.45, -0.2, 0.04), (0.08, 0.08, 0.08))
+    boxes = [(GRASPED, *one), (TARGET, *other), *hand_boxes(FAR)]
+    pairs = [(surface(*one), surface(*other))]
+    found, _, label = segment(gantry, boxes, at=FAR, pairs=pairs)
+    for role in ("grasped", "target"):
+        assert "grasped_region_lower" in found.problems[role]
+        assert "0.45, -0.2" in found.problems[role]
+    assert not np.isin(label, (TARGET, GRASPED)).any()
+    found, truth, label = segment(
+        gantry, boxes, at=FAR, pairs=pairs, grasped_region_lower=[0.2, 0.0]
+    )
+    assert found.problems == {}
+    assert min(*shares(truth, label, GRASPED), *shares(truth, label, TARGET)) > 0.85
+    found, _, _ = segment(gantry, boxes, at=FAR, pairs=pairs, grasped_region_lower=[0.8, 0.0])
+    assert "no two" in found.problems["grasped"]
+
+
+def test_pairs_of_another_shape_are_refused(gantry):
+    boxes = [(GRASPED, *CUP), (TARGET, *BOX), *hand_boxes(FAR)]
+    pole = surface((0.5, 0.1, 0.12), (0.03, 0.03, 0.24))
+    found, _, label = segment(gantry, boxes, at=FAR, pairs=[(pole, pole)])
+    assert "looks like the demonstrations' grasped object" in found.problems["grasped"]
+    assert not np.isin(label, (TARGET, GRASPED)).any()
+
+
 def test_objects_outside_the_region_are_refused(gantry):
     found, _, label = segment(gantry, [(TARGET, *CUP)], region_upper=[0.45, 0.5])
     assert "region" in found.problems["target"]
@@ -309,17 +381,19 @@ def test_the_table_is_fitted_beside_what_stands_on_it(x_slope, y_slope, height):
 
 def test_likeness_ignores_place_and_turn_and_knows_shapes():
     box = surface((0.5, 0.1, 0.05), (0.10, 0.08, 0.10))
-    likeness = ShapeLikeness([box])
+    likeness = ShapeLikeness([[box]])
     c, s = np.cos(0.7), np.sin(0.7)
     turned = box @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T + [0.1, -0.4, 0.0]
     larger = 1.4 * box
     slab = surface((0.5, 0.1, 0.02), (0.20, 0.10, 0.04))
     pole = surface((0.5, 0.1, 0.12), (0.03, 0.03, 0.24))
-    differences = [likeness.difference(points) for points in (turned, larger, slab, pole)]
+    differences = [
+        likeness.difference([likeness.describe(points)]) for points in (turned, larger, slab, pole)
+    ]
     assert max(differences[:2]) < 0.06
     assert min(differences[2:]) > 0.15
-    assert likeness.difference(box) < 1e-9
-    assert ShapeLikeness([]).difference(box) == 0.0
+    assert likeness.difference([likeness.describe(box)]) < 1e-9
+    assert ShapeLikeness([]).difference([likeness.describe(box)]) == 0.0
 
 
 def _fix(system, context, name, boxes, X_WC) -> None:
@@ -402,6 +476,7 @@ def test_the_fusion_passes_the_reason_on(gantry):
         ("distinctness", 0.5),
         ("region_lower", [0.9, -0.5]),
         ("region_upper", [0.5]),
+        ("grasped_region_lower", [0.2, 0.6]),
     ],
 )
 def test_settings_out_of_range_are_named(option, value):

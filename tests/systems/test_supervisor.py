@@ -216,3 +216,63 @@ def test_acceleration_is_limited_where_it_is_asked_for():
         run.step()
         assert run.status.holding is holds, (scale, change_of_velocity)
     assert run.status.reason == ""
+
+
+class Gripping(Run):
+    """With the hand's openings, sampled at its 10 Hz."""
+
+    def __init__(self, **config):
+        super().__init__(**config)
+        self.hand(0.08, 0.08)
+        self.step(2)
+
+    def hand(self, commanded, measured, seconds=0.0):
+        self.set(opening_commanded=[commanded], opening_measured=[measured])
+        self.step(round(seconds / STEP))
+
+    def close(self, to, *, commanded=0.0, start=0.08):
+        """The fingers close at 0.1 m/s, and stay for a while."""
+        self.hand(commanded, start, 0.4)  # a real hand takes its time to begin
+        for opening in np.arange(start, to, -0.01):
+            self.hand(commanded, opening, 0.1)
+        self.hand(commanded, to, 0.6)
+
+
+def test_a_lost_object_holds_the_arm():
+    run = Gripping(grip_margin=0.003)
+    run.close(0.032)
+    run.set(position_commanded=HOME + 0.001)
+    run.step(2)
+    assert not run.status.holding, run.status
+    run.hand(0.0, 0.001, 2 * STEP)
+    assert run.status.holding and run.status.cause is Cause.CONTACT
+    assert "lost what it held: its fingers closed from 3.2 cm to 0.1 cm" in run.status.reason
+    np.testing.assert_allclose(run.position, HOME + 0.001)
+
+
+def test_what_was_held_before_the_start_can_be_lost():
+    run = Run(grip_margin=0.003)
+    for opening, steps in ((0.02, 220), (0.0, 2)):
+        run.set(opening_commanded=[0.0], opening_measured=[opening])
+        run.step(steps)
+    assert run.status.holding
+
+
+def test_a_hand_that_does_what_it_is_told_has_lost_nothing():
+    lost = Gripping(grip_margin=0.003)
+    lost.close(0.0)  # on nothing
+    lost.hand(0.08, 0.0, 0.5)  # slow to open
+    lost.hand(0.08, 0.08, 0.5)
+    lost.close(0.04, commanded=0.04)  # as far as it was told
+    lost.hand(0.08, 0.08, 0.5)
+    lost.close(0.03)  # holds,
+    lost.hand(0.0, 0.029, 0.5)  # settles,
+    lost.hand(0.08, 0.029, 0.3)  # lets go,
+    lost.hand(0.08, 0.08, 0.5)
+    lost.hand(0.06, 0.08, 0.5)  # and closes a bit, late
+    lost.hand(0.06, 0.06, 0.5)
+    assert not lost.status.holding, lost.status
+    unchecked = Gripping()
+    unchecked.close(0.03)
+    unchecked.hand(0.0, 0.0, 0.1)
+    assert not unchecked.status.holding

@@ -14,9 +14,11 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
+from iga_drake.planning.routes import pose_error
 from iga_drake.station.panda.command import PandaCommand
 from iga_drake.station.panda.model import PandaModel, add_panda
 from iga_drake.station.simulated.scene import Scene
+from iga_drake.tasks.snapshots import ROBOT, TABLE, read_snapshot
 
 
 class Rest:
@@ -72,6 +74,15 @@ class Rest:
         """Deepest overlap (m) of any two geometries."""
         query = self.plant.get_geometry_query_input_port().Eval(self.context)
         return max((pair.depth for pair in query.ComputePointPairPenetration()), default=0.0)
+
+    def slip(self, held: str, seconds: float) -> tuple[float, float]:
+        """How far (m, rad) what the hand holds, and the table doesn't touch, moves in it."""
+        before = self.panda.X_WE(self.context).inverse() @ self.pose(held)
+        snapshot = read_snapshot(self.plant, self.context, self.panda)
+        assert snapshot.touches(held, ROBOT) and not snapshot.touches(held, TABLE)
+        self.simulator.AdvanceTo(self.context.get_time() + seconds)
+        after = self.panda.X_WE(self.context).inverse() @ self.pose(held)
+        return pose_error(before, after)
 
 
 def tilt(X_WO: RigidTransform) -> float:

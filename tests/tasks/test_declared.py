@@ -13,7 +13,7 @@ from iga_drake.errors import IgaDrakeError
 from iga_drake.station.scenario import Scenario, load_scenario
 from iga_drake.tasks.declared import DeclaredTask
 from iga_drake.tasks.episode import Episode, demonstrations_path
-from iga_drake.tasks.predicates import Lifted, NotTouching, Upright
+from iga_drake.tasks.predicates import CountOf, Lifted, NotTouching, Upright, Within
 from iga_drake.tasks.registry import scenario_task
 from iga_drake.tasks.snapshots import ROBOT, TABLE, Snapshot, TaskError
 
@@ -165,6 +165,22 @@ def test_success_is_the_declared_predicates(task: DeclaredTask, tmp_path: Path):
     assert "tilted" in verdict(0.1, 0.5).reason
 
 
+def test_success_may_be_asked_of_some_of_several_objects(folder: Path, tmp_path: Path):
+    path = folder / "some.yaml"
+    stated = "      - Within: {object: 'crate, puck', other: plinth, frame: seat, distance: 0.1"
+    path.write_text(FILE.replace("success:\n", f"success:\n{stated}, at_least: 1}}\n", 1))
+    task = scenario_task(load_scenario(path))
+    scene = task.scene(0, "demonstration", mesh_folder=tmp_path)
+    some = task.goal(scene.truth).predicates[0]  # type: ignore[attr-defined]
+    assert some == CountOf(
+        predicates=tuple(
+            Within(object=name, other="plinth", frame="seat", distance=0.1)
+            for name in ("crate", "puck")
+        ),
+        at_least=1,
+    )
+
+
 HELD = """
 task:
   name: held_crate
@@ -224,6 +240,16 @@ REFUSED = {
     "its field": ("height: 0.08,", "", "Lifted: height not stated"),
     "its object": ("{object: crate, height", "{object: crote, height", "'crote' found, one of"),
     "its number": ("height: 0.08", "height: high", "Lifted.height: 'high' found, a number"),
+    "how many": (
+        "{object: crate, height",
+        "{object: crate, at_least: 2, height",
+        "1 to 1 expected",
+    ),
+    "how many, a number": (
+        "{object: crate, height",
+        "{object: crate, at_least: some, height",
+        "at_least: 'some' found, a whole number",
+    ),
     "name": ("name: crate_on_plinth", "name: stack", "'stack' is a task that there is already"),
     "object's name": ("      puck:", "      robot:", "'robot' is out of range.*and not world"),
     "upon": (

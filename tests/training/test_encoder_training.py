@@ -10,7 +10,7 @@ from descriptor_runs import assert_same
 from iga_drake.aligners.iga.local_encoder import ENCODER, DecoderConfig, EncoderConfig, load_encoder
 from iga_drake.checkpoint import load_checkpoint
 from iga_drake.dataset.occupancy import OccupancyConfig, make_occupancy_sample
-from iga_drake.paths import models_dir
+from iga_drake.paths import landed_weights
 from iga_drake.training import encoder
 from iga_drake.training.encoder import (
     EncoderSettings,
@@ -106,7 +106,7 @@ def test_training_tells_more_than_the_distance_from_the_centres(tmp_path: Path) 
 
 
 def test_the_landed_encoder_knows_more_than_the_distance_from_the_centres() -> None:
-    net, card = load_encoder(models_dir() / "weights" / "encoder.safetensors")
+    net, card = load_encoder(landed_weights("encoder"))
     assert card["step"] == card["training"]["steps"]
     radii = (0.02, 0.025, 0.03, 0.035, 0.04)
     scores = occupancy_scores(

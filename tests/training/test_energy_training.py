@@ -8,10 +8,10 @@ import pytest
 import torch
 from descriptor_runs import assert_same
 
-from iga_drake.aligners.iga.aligner import default_weights
 from iga_drake.aligners.iga.energy import EnergyConfig, PairEnergyNet
 from iga_drake.aligners.iga.weights import load_energy
 from iga_drake.dataset import alignment_error
+from iga_drake.paths import landed_weights
 from iga_drake.training import energy, energy_problems
 from iga_drake.training.energy import EnergyTraining, train_energy
 from iga_drake.training.energy_problems import (
@@ -60,7 +60,8 @@ def test_a_stopped_training_goes_on_as_if_it_had_not(tmp_path: Path, folder: Pat
 
 @pytest.mark.parametrize("term", ["placing", "ranking"])
 def test_each_term_of_the_loss_is_learnt(folder: Path, term: str) -> None:
-    problems = make_problems(folder, "train_energy", 2, ProblemMaker(default_weights(), MODEL))
+    maker = ProblemMaker(landed_weights("descriptor"), MODEL)
+    problems = make_problems(folder, "train_energy", 2, maker)
     torch.manual_seed(0)
     net = PairEnergyNet(MODEL)
     optimizer = torch.optim.Adam(net.parameters(), lr=1e-2)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from iga_drake.aligners.iga.aligner import IgaAligner, default_weights
+from iga_drake.aligners.iga.aligner import IgaAligner
 from iga_drake.aligners.iga.familiarity import FIGURES, FamiliarityNet
+from iga_drake.paths import landed_weights
 from iga_drake.training.familiarity import (
     Answer,
     Example,
@@ -88,7 +89,7 @@ def test_it_is_written_with_what_it_was_fitted_to(tmp_path: Path) -> None:
         and {"own", "swapped", "ring"} <= set(card["refused"])
     )
     path = tmp_path / "familiarity.safetensors"
-    aligner = IgaAligner(weights=default_weights(), familiarity=path)
+    aligner = IgaAligner(weights=landed_weights("descriptor"), familiarity=path)
     assert isinstance(aligner, IgaAligner)
     with torch.no_grad():
         assert FamiliarityNet().typical.shape == (5,)

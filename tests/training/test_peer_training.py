@@ -9,7 +9,6 @@ import yaml
 from descriptor_runs import assert_same
 
 from iga_drake import cli
-from iga_drake.aligners.peers.networks import load_peer
 from iga_drake.aligners.registry import make_aligner
 from iga_drake.checkpoint import load_checkpoint
 from iga_drake.cli.train_peers import PEERS
@@ -87,7 +86,7 @@ def test_a_stopped_run_goes_on_to_the_same_weights(name: str, tmp_path: Path) ->
     # The weights are the aligner's.
     path = tmp_path / "half" / f"{name}.safetensors"
     aligner = make_aligner(name, weights=path)
-    net, _ = load_peer(path, name, type(peer.model), peer.network)
+    net, _ = peer.aligner.load(path)
     assert (
         aligner.weights_digest != make_aligner(name, weights=_other(path, net, name)).weights_digest
     )
@@ -109,7 +108,7 @@ def test_the_loss_falls_on_a_few_samples(name: str) -> None:
     config = peers.replaced(peer.training, chosen["training"], "training")
     batch = collate([peer.make("train", index, samples) for index in range(2)])
     torch.manual_seed(0)
-    net = peer.network(peers.replaced(peer.model, chosen["model"], "model"))
+    net = peer.aligner.network(peers.replaced(peer.model, chosen["model"], "model"))
     optimizer = torch.optim.Adam(net.parameters(), lr=5e-3)
     losses = []
     for step in range(60):

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,12 +31,20 @@ from iga_drake.aligners.iga.familiarity import (
 )
 from iga_drake.aligners.iga.node_clouds import NodeClouds, beside_clutter, drawn_points
 from iga_drake.aligners.iga.voting import Match, VotingConfig, cast_votes, match_objects, modes
+from iga_drake.aligners.iga.weights import (
+    DESCRIPTOR,
+    ENERGY,
+    FAMILIARITY,
+    load_descriptor,
+    load_energy,
+    load_familiarity,
+)
 from iga_drake.aligners.protocol import AlignerError, PoseEstimate, check_question
-from iga_drake.checkpoint import CheckpointError, file_digest, network_digest
+from iga_drake.checkpoint import CheckpointError, with_digest
 from iga_drake.demonstrations.alignment import Alignment, check_direction
 from iga_drake.errors import shortened
 from iga_drake.geometry.se3 import inverse
-from iga_drake.paths import models_dir
+from iga_drake.paths import landed_weights
 
 LANDED = "landed"
 MINIMUM = 16  # distinct points that a cloud keeps
@@ -124,21 +133,6 @@ def _known_ups(context: Sequence[Alignment]) -> list[bool]:
     return [all(getattr(alignment, name) is not None for alignment in context) for name in UPS]
 
 
-def default_weights() -> Path:
-    """The landed checkpoint of the descriptor network."""
-    return models_dir() / "weights" / "descriptor.safetensors"
-
-
-def default_familiarity() -> Path:
-    """The landed checkpoint of the familiarity."""
-    return models_dir() / "weights" / "familiarity.safetensors"
-
-
-def default_energy() -> Path:
-    """The landed checkpoint of the energy."""
-    return models_dir() / "weights" / "energy.safetensors"
-
-
 class IgaAligner:
     """`Aligner` by dense SE(3)-invariant correspondence and consistency voting.
 
@@ -168,42 +162,34 @@ class IgaAligner:
         The networks themselves are left as they are. Raises `CheckpointError` (`checkpoint`) for a
         missing or foreign file, or a familiarity fitted to other descriptors.
         """
-        from iga_drake.aligners.iga.weights import load_descriptor, load_energy, load_familiarity
-
         self.config = config or IgaConfig()
         if self.config.ranking not in RANKINGS:
             raise AlignerError(
                 f"iga: ranking '{self.config.ranking}', must be one of: {', '.join(RANKINGS)}"
             )
         if familiarity == LANDED:
-            familiarity = default_familiarity() if net is None and weights is None else None
-        if net is None:
-            path = Path(weights) if weights else default_weights()
-            net, _ = load_descriptor(path)
-            digests = [file_digest(path)]
-        else:
-            digests = [network_digest(net)]
-        if isinstance(familiarity, (str, Path)):
-            path = Path(familiarity)
-            familiarity, card = load_familiarity(path)
-            digests.append(file_digest(path))
-            if card.get("descriptor") != digests[0]:
+            familiarity = landed_weights(FAMILIARITY) if net is None and weights is None else None
+        given = net if net is not None else weights or landed_weights(DESCRIPTOR)
+        net, _, digest = with_digest(given, load_descriptor)
+        digests = [digest]
+        if familiarity is not None:
+            path = familiarity
+            familiarity, card, digest = with_digest(path, load_familiarity)
+            digests.append(digest)
+            if card is not None and card.get("descriptor") != digests[0]:
                 raise CheckpointError(
                     f"{path}: fitted to the descriptors {shortened(card.get('descriptor'))}, in "
                     f"use are {digests[0]}: fit it again with `iga train familiarity`"
                 )
-        elif familiarity is not None:
-            digests.append(network_digest(familiarity))
         if self.config.ranking == "vote":
             energy = None
         elif energy is None:
             raise AlignerError("iga: ranking 'energy' needs an energy: name its weights")
-        if isinstance(energy, (str, Path)):
-            path = default_energy() if energy == LANDED else Path(energy)
-            energy, _ = load_energy(path)
-            digests.append(file_digest(path))
-        elif energy is not None:
-            digests.append(network_digest(energy))
+        else:
+            energy, _, digest = with_digest(
+                landed_weights(ENERGY) if energy == LANDED else energy, load_energy
+            )
+            digests.append(digest)
         self.weights_digest = "+".join(digests)
         self._energy = copy.deepcopy(energy).eval().double() if energy is not None else None
         self._familiarity = (
@@ -475,3 +461,8 @@ class IgaAligner:
             memory=memory,
         )
         return ready, found
+
+
+def make_iga_energy(**options: Any) -> IgaAligner:
+    """The aligner whose learned energy places and ranks the poses."""
+    return IgaAligner(config=IgaConfig(ranking="energy"), **options)

@@ -16,7 +16,7 @@ from iga_drake.aligners.protocol import AlignerError, PoseEstimate, check_questi
 from iga_drake.checkpoint import file_digest, network_digest
 from iga_drake.demonstrations.alignment import Alignment
 from iga_drake.geometry.se3 import geodesic_angle, nearest_rotation
-from iga_drake.paths import models_dir
+from iga_drake.paths import landed_weights
 
 DISTINCT_PLACE = 0.02  # m: particles nearer than this are one mode
 DISTINCT_TURN = 0.35  # rad
@@ -33,11 +33,6 @@ class IgaPaperConfig:
     modes: int = 5  # at most so many poses are given
 
 
-def landed(part: str) -> Path:
-    """Path of the checkpoint of a part that comes with the package."""
-    return models_dir() / "weights" / f"{kind_of(part)}.safetensors"
-
-
 def found_path(part: str, path: Path | str | None, name: str) -> Path:
     """Path of a part's checkpoint for the aligner `name`.
 
@@ -45,7 +40,7 @@ def found_path(part: str, path: Path | str | None, name: str) -> Path:
     weights where validation chose any); None means the checkpoint that comes with the package.
     Raises `AlignerError`.
     """
-    chosen = Path(path) if path else landed(part)
+    chosen = Path(path) if path else landed_weights(kind_of(part))
     file = f"{kind_of(part)}.safetensors"
     places = [chosen / file, chosen / part / "best.safetensors", chosen / part / file]
     for place in places if chosen.is_dir() else [chosen]:

@@ -19,14 +19,10 @@ import torch
 from torch import Tensor, nn
 
 from iga_drake.aligners.iga.descriptor import DescriptorConfig, DescriptorNet
-from iga_drake.aligners.iga.node_clouds import NodeClouds, drawn_points
-from iga_drake.aligners.peers.networks import landed_weights, load_peer, one_pose, rigid_pose
-from iga_drake.aligners.protocol import PoseEstimate, check_question
-from iga_drake.checkpoint import file_digest, network_digest
-from iga_drake.demonstrations.alignment import Alignment
+from iga_drake.aligners.iga.node_clouds import NodeClouds
+from iga_drake.aligners.peers.aligner import PeerAligner, rigid_pose
 from iga_drake.geometry.se3 import kabsch
 
-RELDIST = "reldist"
 UNIT = 0.05  # m, the kernel's unit of length
 _LOG_TEMPERATURE = 3.4  # at first, of the matches
 _DAMPING = 1e-3  # of the normal equations, relative to their trace
@@ -164,67 +160,34 @@ class RelDistNet(nn.Module):
         return Multilateration(logits, distance, scale, x, weight, kabsch(A[:, D], x, weight))
 
 
-@dataclass(frozen=True)
-class RelDistSearch:
-    """Options of the aligner."""
+class RelDistAligner(PeerAligner[RelDistNet]):
+    """`PeerAligner` by predicted distances between the objects. The energy is the mean error of the
+    distances under the pose, in units of what the network expects."""
 
-    points: int = 512  # of a cloud, at most; drawn where there are more
-    nodes: int = 64
-
-
-class RelDistAligner:
-    """`Aligner` by predicted distances between the objects. One pose; its energy is the mean error
-    of the distances under it, in units of what the network expects."""
-
-    name = RELDIST
+    name, sizes, network = "reldist", RelDistConfig, RelDistNet
 
     def __init__(
-        self,
-        net: RelDistNet | None = None,
-        *,
-        weights: Path | str | None = None,
-        config: RelDistSearch | None = None,
+        self, net: RelDistNet | None = None, *, weights: Path | str | None = None, nodes: int = 64
     ):
-        """Takes a network, or reads the file `weights`; default: the landed one.
+        super().__init__(net, weights=weights)
+        self._nodes = nodes
 
-        Raises `CheckpointError`.
-        """
-        if net is None:
-            path = Path(weights or landed_weights(RELDIST))
-            net, _ = load_peer(path, RELDIST, RelDistConfig, RelDistNet)
-            self.weights_digest = file_digest(path)
-        else:
-            self.weights_digest = network_digest(net)
-        self.net = net.eval()
-        self.config = config or RelDistSearch()
+    @property
+    def nodes(self) -> int:
+        return self._nodes
 
-    @torch.no_grad()
-    def align(
-        self,
-        context: tuple[Alignment, ...],
-        grasped: np.ndarray,
-        target: np.ndarray,
-        *,
-        grasped_up: np.ndarray | None = None,
-        target_up: np.ndarray | None = None,
-        seed: int = 0,
-    ) -> PoseEstimate:
-        """See `Aligner.align`. Ways up are not used."""
-        test = check_question(self.name, context, grasped, target, seed=seed)
-        pairs = [*((a.grasped, a.target) for a in context), test]
-        clouds = [pair[role] for role in range(2) for pair in pairs]
-        drawn = [drawn_points(c, self.config.points, guard=True, seed=seed) for c in clouds]
-        # Of A and of B together, so that they have as many points and nodes.
-        ready = NodeClouds.of(clouds, drawn, self.config.nodes, [None] * len(clouds))
-        N = len(pairs)
+    def pose(self, clouds: NodeClouds, *, seed: int) -> tuple[np.ndarray, float]:
+        """See `PeerAligner.pose`."""
+        N = len(clouds.pose) // 2
         # Near the origin, where single precision is enough; the test's objects in own frames.
-        places = (ready.as_given - ready.pose[N:, :3, 3].repeat(2, 1)[:, None]).unflatten(0, (2, N))
-        places[:, -1] = ready.at_nodes.unflatten(0, (2, N))[:, -1]
-        points, nodes = (each.unflatten(0, (2, N)) for each in (ready.points, ready.nodes))
+        shift = clouds.pose[N:, :3, 3].repeat(2, 1)
+        places = (clouds.as_given - shift[:, None]).unflatten(0, (2, N))
+        places[:, -1] = clouds.at_nodes.unflatten(0, (2, N))[:, -1]
+        points, nodes = (each.unflatten(0, (2, N)) for each in (clouds.points, clouds.nodes))
         found = self.net(points.float(), nodes, places.float())
         X = rigid_pose(found.motion[0])
         A, B = places[:, -1].numpy()
         off = np.linalg.norm((A @ X[:3, :3].T + X[:3, 3])[:, None] - B, axis=-1)
         error = np.abs(off - found.distance[0].numpy()) / found.scale[0].numpy()
-        own_A, own_B = ready.pose[N - 1].numpy(), ready.pose[-1].numpy()
-        return one_pose(own_B @ X @ np.linalg.inv(own_A), float(error.mean()))
+        own_A, own_B = clouds.pose[N - 1].numpy(), clouds.pose[-1].numpy()
+        return own_B @ X @ np.linalg.inv(own_A), float(error.mean())

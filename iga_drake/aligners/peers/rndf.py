@@ -22,15 +22,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from iga_drake.aligners.iga.node_clouds import NodeClouds, drawn_points
+from iga_drake.aligners.iga.node_clouds import NodeClouds
 from iga_drake.aligners.iga.vector_neurons import VectorLeakyReLU, VectorLinear
-from iga_drake.aligners.peers.networks import landed_weights, load_peer, one_pose
-from iga_drake.aligners.protocol import PoseEstimate, check_question
-from iga_drake.checkpoint import file_digest, network_digest
-from iga_drake.demonstrations.alignment import Alignment
+from iga_drake.aligners.peers.aligner import PeerAligner
 from iga_drake.geometry.se3 import inverse, random_rotations, rigid, so3_exp
 
-RNDF = "rndf"
 UNIT = 0.1  # m, the network's unit of length
 
 
@@ -149,11 +145,11 @@ def meeting_place(A: Tensor, B: Tensor, *, near: float = 0.01) -> Tensor:
     return (weight[:, None] * (A + B[of_B]) / 2).sum(0)
 
 
-class RndfAligner:
-    """`Aligner` by descriptor fields. One pose; its energy is the sum of the mean differences of
-    both objects' descriptors from the demonstrated ones."""
+class RndfAligner(PeerAligner[DescriptorField]):
+    """`PeerAligner` by descriptor fields. The energy is the sum of the mean differences of both
+    objects' descriptors from the demonstrated ones."""
 
-    name = RNDF
+    name, sizes, network = "rndf", RndfConfig, DescriptorField
 
     def __init__(
         self,
@@ -162,43 +158,22 @@ class RndfAligner:
         weights: Path | str | None = None,
         config: RndfSearch | None = None,
     ):
-        """Takes a network, or reads the file `weights`; default: the landed one.
-
-        Raises `CheckpointError`.
-        """
-        if net is None:
-            path = Path(weights or landed_weights(RNDF))
-            net, _ = load_peer(path, RNDF, RndfConfig, DescriptorField)
-            self.weights_digest = file_digest(path)
-        else:
-            self.weights_digest = network_digest(net)
-        self.net = net.eval().requires_grad_(False)
+        super().__init__(net, weights=weights)
         self.config = config or RndfSearch()
 
-    def align(
-        self,
-        context: tuple[Alignment, ...],
-        grasped: np.ndarray,
-        target: np.ndarray,
-        *,
-        grasped_up: np.ndarray | None = None,
-        target_up: np.ndarray | None = None,
-        seed: int = 0,
-    ) -> PoseEstimate:
-        """See `Aligner.align`. Ways up are not used."""
-        test = check_question(self.name, context, grasped, target, seed=seed)
-        pairs = [*((a.grasped, a.target) for a in context), test]
-        clouds = [pair[role] for role in range(2) for pair in pairs]
-        drawn = [drawn_points(c, 512, guard=True, seed=seed) for c in clouds]
-        ready = NodeClouds.of(clouds, drawn, self.net.config.points, [None] * len(clouds))
-        N, generator = len(pairs), torch.Generator().manual_seed(seed)
+    @property
+    def nodes(self) -> int:
+        return self.net.config.points
+
+    def pose(self, clouds: NodeClouds, *, seed: int) -> tuple[np.ndarray, float]:
+        """See `PeerAligner.pose`."""
+        N, generator = len(clouds.pose) // 2, torch.Generator().manual_seed(seed)
         # Demonstrations near the origin, the test's objects each about its centre.
-        shift = ready.pose[N:, :3, 3].repeat(2, 1)
-        shift[N - 1] = ready.pose[N - 1, :3, 3]
-        points = (ready.as_given - shift[:, None]).float()  # (2 N, P, 3)
-        centre = (ready.pose[:, :3, 3] - shift).float()
-        with torch.no_grad():
-            latent = self.net.encode((points - centre[:, None]) / UNIT)
+        shift = clouds.pose[N:, :3, 3].repeat(2, 1)
+        shift[N - 1] = clouds.pose[N - 1, :3, 3]
+        points = (clouds.as_given - shift[:, None]).float()  # (2 N, P, 3)
+        centre = (clouds.pose[:, :3, 3] - shift).float()
+        latent = self.net.encode((points - centre[:, None]) / UNIT)
         seen = [_Seen(latent[k : k + 1], centre[k]) for k in range(2 * N)]
         A, B = seen[:N], seen[N:]
         places = [meeting_place(points[d], points[N + d]) for d in range(N - 1)]
@@ -212,7 +187,7 @@ class RndfAligner:
         (of_A, off_A), (of_B, off_B) = found
         X = (of_B.double() @ inverse(of_A.double())).numpy()
         X[:3, 3] += shift[-1].numpy() - X[:3, :3] @ shift[N - 1].numpy()
-        return one_pose(X, off_A + off_B)
+        return X, off_A + off_B
 
     def _demonstrated(
         self,
@@ -257,8 +232,7 @@ class RndfAligner:
                 ]
             ).sum(0)
 
-        with torch.no_grad():
-            coarse = off(R, t, slice(config.coarse_queries))
+        coarse = off(R, t, slice(config.coarse_queries))
         best = coarse.topk(min(config.kept, len(R)), largest=False).indices
         R, pivot = R[best], pivots[1] + (R @ (query.mean(0) - pivots[0]))[best]
         arm = query.mean(0)  # turns are about the middle of the query points
@@ -297,8 +271,7 @@ class RndfAligner:
                 off(*posed(), slice(None)).sum().backward()
                 optimizer.step()
                 schedule.step()
-        with torch.no_grad():
-            error = off(*posed(), slice(None))
-            k = int(error.argmin())
-            turned, moved = (each[k].detach() for each in posed())
+        error = off(*posed(), slice(None))
+        k = int(error.argmin())
+        turned, moved = (each[k] for each in posed())
         return rigid(turned, moved), float(error[k])

@@ -12,21 +12,16 @@ samples.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from iga_drake.aligners.iga.node_clouds import NodeClouds, drawn_points
-from iga_drake.aligners.peers.networks import landed_weights, load_peer, one_pose, rigid_pose
-from iga_drake.aligners.protocol import PoseEstimate, check_question
-from iga_drake.checkpoint import file_digest, network_digest
-from iga_drake.demonstrations.alignment import Alignment
+from iga_drake.aligners.iga.node_clouds import NodeClouds
+from iga_drake.aligners.peers.aligner import PeerAligner, rigid_pose
 from iga_drake.geometry.se3 import inverse, kabsch, transform
 
-TAXPOSE = "taxpose"
 UNIT = 0.1  # m, the networks' unit of length
 
 
@@ -190,48 +185,24 @@ class OwnFrames:
         return OwnFrames(shown[:, 0], shown[:, 1], A, B, pose[:, 0, -1], pose[:, 1, -1])
 
 
-class TaxPoseAligner:
-    """`Aligner` by soft correspondences. One pose; its energy is the mean distance (cm) of A's
-    points under it from the places that were told."""
+class TaxPoseAligner(PeerAligner[TaxPoseNet]):
+    """`PeerAligner` by soft correspondences. The energy is the mean distance (cm) of A's points
+    under the pose from the places that were told."""
 
-    name = TAXPOSE
+    name, sizes, network = "taxpose", TaxPoseConfig, TaxPoseNet
 
-    def __init__(self, net: TaxPoseNet | None = None, *, weights: Path | str | None = None):
-        """Takes a network, or reads the file `weights`; default: the landed one.
+    @property
+    def nodes(self) -> int:
+        return self.net.config.points
 
-        Raises `CheckpointError`.
-        """
-        if net is None:
-            path = Path(weights or landed_weights(TAXPOSE))
-            net, _ = load_peer(path, TAXPOSE, TaxPoseConfig, TaxPoseNet)
-            self.weights_digest = file_digest(path)
-        else:
-            self.weights_digest = network_digest(net)
-        self.net = net.eval()
-
-    @torch.no_grad()
-    def align(
-        self,
-        context: tuple[Alignment, ...],
-        grasped: np.ndarray,
-        target: np.ndarray,
-        *,
-        grasped_up: np.ndarray | None = None,
-        target_up: np.ndarray | None = None,
-        seed: int = 0,
-    ) -> PoseEstimate:
-        """See `Aligner.align`. Ways up are not used."""
-        test = check_question(self.name, context, grasped, target, seed=seed)
-        pairs = [*((a.grasped, a.target) for a in context), test]
-        clouds = [pair[role] for role in range(2) for pair in pairs]
-        drawn = [drawn_points(c, 512, guard=True, seed=seed) for c in clouds]
-        ready = NodeClouds.of(clouds, drawn, self.net.config.points, [None] * len(clouds))
-        shape = (1, 2, len(pairs))
-        own = OwnFrames.of(ready.as_given.unflatten(0, shape), ready.pose.unflatten(0, shape))
+    def pose(self, clouds: NodeClouds, *, seed: int) -> tuple[np.ndarray, float]:
+        """See `PeerAligner.pose`."""
+        shape = (1, 2, len(clouds.pose) // 2)
+        own = OwnFrames.of(clouds.as_given.unflatten(0, shape), clouds.pose.unflatten(0, shape))
         embedding = self.net.embed(own.shown_A.float(), own.shown_B.float())
         found = self.net(embedding, own.A.float(), own.B.float())
         X = rigid_pose(found.motion[0])
         there = own.A[0].numpy() @ X[:3, :3].T + X[:3, 3]
         off = 100 * np.linalg.norm(there - found.of_A[0].numpy(), axis=-1).mean()
         pose_A, pose_B = own.pose_A[0].numpy(), own.pose_B[0].numpy()
-        return one_pose(pose_B @ X @ np.linalg.inv(pose_A), float(off))
+        return pose_B @ X @ np.linalg.inv(pose_A), float(off)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from iga_drake.paths import models_dir
+from iga_drake.paths import landed_weights
 from iga_drake.shapes.deformers.protocol import DeformableShape
 from iga_drake.shapes.dif_net import (
     DifNet,
@@ -23,11 +23,6 @@ from iga_drake.shapes.dif_net import (
     siren_jacobian,
 )
 from iga_drake.shapes.errors import ShapeError
-
-
-def default_dif_net_weights() -> Path:
-    """The weights that come with the package."""
-    return models_dir() / "weights" / "dif_net.safetensors"
 
 
 @lru_cache(maxsize=4)
@@ -72,7 +67,7 @@ class DifNetDeformer:
           checked_points: vertices at which folding is looked for; 0 looks nowhere.
           double: takes the package's weights in double precision.
         """
-        self.net = (_landed(default_dif_net_weights(), double) if net is None else net).eval()
+        self.net = (_landed(landed_weights("dif_net"), double) if net is None else net).eval()
         if len(self.net.latents) < 2:
             raise ShapeError(
                 f"DifNetDeformer: {len(self.net.latents)} trained latents, at least 2 are needed"

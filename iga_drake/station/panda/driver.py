@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort
+from pydrake.systems.framework import DiagramBuilder, InputPort, LeafSystem, OutputPort
 from pydrake.systems.lcm import LcmBuses
 from pydrake.systems.primitives import MatrixGain
 
@@ -108,9 +108,10 @@ def _find_bus(
 
 
 def connect_server(
-    builder: DiagramBuilder, server: PandaServer, ports: Mapping[str, InputPort | OutputPort]
+    builder: DiagramBuilder, server: LeafSystem, ports: Mapping[str, InputPort | OutputPort]
 ) -> None:
-    """Connects a server to the arm's and the hand's ports by their names in the port contract."""
+    """Connects a `PandaServer` or an `FciPort` to the arm's and the hand's ports by their names in
+    the port contract."""
     for i in range(server.num_output_ports()):
         output = server.get_output_port(i)
         builder.Connect(output, cast(InputPort, ports[output.get_name()]))

@@ -6,13 +6,14 @@ import pytest
 import torch
 
 from iga_drake.aligners.icp import IcpAligner
-from iga_drake.aligners.iga.aligner import IgaAligner, IgaConfig, default_weights
+from iga_drake.aligners.iga.aligner import IgaAligner, IgaConfig
 from iga_drake.aligners.iga.descriptor import DescriptorNet
 from iga_drake.aligners.iga.weights import load_descriptor
 from iga_drake.dataset.alignment_error import pose_errors, random_pose
 from iga_drake.dataset.samples import make_sample
 from iga_drake.demonstrations.alignment import Alignment, CloudError
 from iga_drake.evaluation.alignment import evaluate_alignment
+from iga_drake.paths import landed_weights
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +142,7 @@ class _SeesPatches(DescriptorNet):
 
 def test_clutter_is_left_out(aligner: IgaAligner) -> None:
     """A patch beside the target: the answer is that without it."""
-    landed, _ = load_descriptor(default_weights())
+    landed, _ = load_descriptor(landed_weights("descriptor"))
     net = _SeesPatches(landed.config)
     net.load_state_dict(landed.state_dict())
     context, A, B = _problem(4)

@@ -2,6 +2,7 @@
 
 import datetime
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +33,16 @@ def clock(context: Context) -> float:
     return EPOCH + context.get_time()
 
 
-def hardware_scenario(folder: Path, *, small: bool = True) -> Scenario:
-    """The stub's cameras, calibrated now, on an in-process bus; `small` images are quick."""
+# Quick to look at, and one that has the whole arm in view.
+SMALL = Intrinsics(32, 24, fx=31.0, fy=31.0, cx=15.5, cy=11.5)
+WIDE = Intrinsics(320, 240, fx=200.0, fy=200.0, cx=159.5, cy=119.5)
+
+
+def hardware_scenario(folder: Path, intrinsics: Intrinsics | None = SMALL) -> Scenario:
+    """The stub's cameras, calibrated now, on an in-process bus; None leaves their intrinsics."""
     scenario = make_scenario()
-    if small:
-        for camera in scenario.cameras.values():
-            camera.intrinsics = Intrinsics(32, 24, fx=31.0, fy=31.0, cx=15.5, cy=11.5)
+    for camera in scenario.cameras.values():
+        camera.intrinsics = replace(intrinsics or camera.intrinsics)
     scenario.station = "hardware"
     scenario.lcm_buses = {"default": DrakeLcmParams(lcm_url="memq://")}
     scenario.hardware.calibration = str(folder)

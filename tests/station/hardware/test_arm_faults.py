@@ -14,17 +14,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from control_fixtures import panda_robot
 from drake import lcmt_image_array
 from pydrake.lcm import DrakeLcm
 from pydrake.math import RollPitchYaw
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
-from rig import EPOCH, START, add_arm, calibration_of, clock, hardware_scenario
+from rig import EPOCH, START, WIDE, add_arm, calibration_of, clock, hardware_scenario
 
 from iga_drake.aligners.protocol import PoseEstimate
 from iga_drake.policy.inference import LocalInference
 from iga_drake.policy.motion import Phase
-from iga_drake.station.cameras.rgbd import Pose
+from iga_drake.station.cameras.rgbd import Pose, true_pose
 from iga_drake.station.contract import StationError
 from iga_drake.station.hardware.calibration import write_calibration
 from iga_drake.station.hardware.images import decode_images, encode_images
@@ -33,7 +34,7 @@ from iga_drake.station.lcm import utime_of
 from iga_drake.station.panda import messages
 from iga_drake.station.panda.client import PandaStart
 from iga_drake.systems.messages import Cause
-from iga_drake.systems.ports import ArmMode
+from iga_drake.systems.ports import ArmMode, Role
 from iga_drake.tasks.grasp import Grasp
 from iga_drake.tasks.robot_diagram import build_robot_diagram
 
@@ -56,12 +57,14 @@ class Robot:
     """Policy to hardware station on one side of LCM, the stub's arm and cameras on the other."""
 
     def __init__(self, folder: Path) -> None:
-        scenario = hardware_scenario(folder, small=False)
+        scenario = hardware_scenario(folder, WIDE)
         scenario.supervisor.hand_age = 0.2
         scenario.supervisor.camera_age = 0.25
+        scenario.supervisor.grip_margin = 0.003
         scenario.policy.observe_settle = LOOK
         scenario.policy.observe_limit = 0.04
-        scenario.fusion.maximum_age = 0.12
+        scenario.fusion.maximum_age, scenario.fusion.minimum_valid = 0.12, 0.001
+        self.scenario = scenario
         self.late = 0.0  # s, by which the diagram lags behind the clock
 
         def now(context: Context) -> float:
@@ -361,6 +364,51 @@ def repeated() -> Callable:
     return pass_on
 
 
+def test_an_object_lost_on_the_way(moving: Robot):
+    """The hand that carries it tells its opening ten times a second."""
+    commanded = moving.built.diagram.GetSubsystemByName("follower").GetOutputPort("hand.opening")
+    context = commanded.get_system().GetMyContextFromRoot(moving.simulator.get_context())
+    held = float(commanded.Eval(context)[0]) + 0.02
+
+    def opening(value: float) -> None:
+        moving.stub._faults["hand.opening_measured"] = np.array([value])
+
+    opening(held)
+    moving.begin()
+    moving.advance(1.3)
+    assert moving.status.phase is Phase.MOVE and not moving.holding, moving.status.reason
+    opening(held - 0.02)
+    check_held(moving, Cause.CONTACT, "the hand has lost what it held", within=0.1 + WITHIN)
+
+
+def with_the_robot(robot: Robot, camera: str) -> Callable:
+    """Pixels of the hand are labelled as the target's."""
+    K, X_WC = robot.scenario.cameras[camera].intrinsics, true_pose(robot.scenario.cameras[camera])
+    p_CH = X_WC.inverse() @ panda_robot().pose(START).multiply([0.0, 0.0, -0.07])
+    rows, columns = np.mgrid[: K.height, : K.width]
+    u, v = K.fx * p_CH[0] / p_CH[2] + K.cx, K.fy * p_CH[1] / p_CH[2] + K.cy
+    hand = np.hypot(columns - u, rows - v)[:, :, None] < K.fx * 0.05 / p_CH[2]
+
+    def pass_on(data: bytes) -> bytes:
+        message = lcmt_image_array.decode(data)
+        images = decode_images(message, "")
+        images["depth"] = np.where(hand, np.float32(p_CH[2]), images["depth"])
+        images["label"] = np.where(hand, np.int16(Role.TARGET), np.int16(Role.BACKGROUND))
+        return encode_images(images, utime=message.header.utime).encode()
+
+    return pass_on
+
+
+def test_a_mask_with_the_robot_in_it_is_refused(robot: Robot):
+    robot.restart()
+    for name, sender in robot.senders.items():
+        sender.link = with_the_robot(robot, name)
+    robot.begin()
+    robot.advance(LOOK)
+    check_held(robot, Cause.PERCEPTION, "of the points of '.*' lie on the robot, at most 30 %")
+    np.testing.assert_array_equal(robot.joints, START)
+
+
 # Name -> what the left camera sends in place of its messages, and the reason told.
 CAMERAS: dict[str, tuple[Callable | None, str]] = {
     # Of the episode before there may be one left, which is of another time.
@@ -391,7 +439,7 @@ def test_the_next_episode_runs(moving: Robot):
 
 
 def test_an_inverted_calibration_is_refused(tmp_path: Path):
-    scenario = hardware_scenario(tmp_path, small=False)
+    scenario = hardware_scenario(tmp_path, None)
     calibration = calibration_of(scenario, "left")
     X_CW = calibration.X_WC.inverse()
     pose = Pose(list(X_CW.translation()), list(RollPitchYaw(X_CW.rotation()).vector()))

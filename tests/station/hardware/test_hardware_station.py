@@ -37,7 +37,7 @@ class Above:
 
 
 def test_does_the_task_over_lcm(tmp_path: Path):
-    scenario = hardware_scenario(tmp_path, small=False)
+    scenario = hardware_scenario(tmp_path, None)
     scenario.control.period = 0.01
     scenario.supervisor.acceleration_scale = 1.0
     lcm = DrakeLcm("memq://")

@@ -23,7 +23,7 @@ class Cell:
     """The hardware station, and behind its bus an arm, in one diagram with the port contract."""
 
     def __init__(self, folder: Path, control_mode: str) -> None:
-        scenario = hardware_scenario(folder, small=False)
+        scenario = hardware_scenario(folder, None)
         scenario.model_drivers["panda"].control_mode = control_mode
         builder, lcm = DiagramBuilder(), DrakeLcm("memq://")
         hardware = build_hardware_station(
