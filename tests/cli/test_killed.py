@@ -113,8 +113,8 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
 
 
 def training_of(folder: Path) -> dict[str, Any]:
-    """Tensors bit by bit, cards and log of a training, without times."""
-    clock = ("seconds", "samples_per_second", "memory_mib", "workers_mib")
+    """Tensors bit by bit, cards and log of a training, without times and the checkout's commit."""
+    clock = ("seconds", "samples_per_second", "memory_mib", "workers_mib", "commit")
 
     def timeless(row: dict) -> dict:
         return {k: v for k, v in row.items() if k not in clock}
