@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from iga_drake.demonstrations.recording import Recording
 
 MOST = 10_000
-_ATTEMPTS = 8  # of one process: Drake keeps some 60 MB of every diagram with Python's systems
+_ATTEMPTS = 4  # of one process: Drake keeps some 60 MB of every diagram with Python's systems
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

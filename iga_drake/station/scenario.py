@@ -149,7 +149,7 @@ class Scenario:
     # Number of further objects on the table, of families that the task isn't about, out of the way
     # and background to the cameras (`iga_drake.tasks.distractors`).
     distractors: int = 0
-    # Errors of the simulated cameras at the objects: masks that leak, stray depth.
+    # Errors of the simulated cameras at the objects: wrong masks, stray depth.
     clutter: Clutter = field(default_factory=Clutter)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     # Whose labels tell the objects apart: the station's, or those of the geometric segmenter.

@@ -43,7 +43,7 @@ class FamiliarityTraining:
 
     samples: int = 300
     first: int = 0  # of the samples
-    refused: float = 0.01  # share of the questions about objects as they are below one half
+    refused: float = 0.02  # share of the questions about objects as they are below one half
 
     def __post_init__(self) -> None:
         if self.samples < 8 or self.first < 0 or not 0 < self.refused < 0.5:

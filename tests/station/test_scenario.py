@@ -59,7 +59,7 @@ def test_task_scenarios_differ_in_the_task_only():
 @pytest.mark.parametrize("name", ["grasp", "stack"])
 def test_field_adds_clutter_and_nothing_else(name):
     plain, field = load_scenario(name), load_scenario(name, "field")
-    assert not plain.clutter.any
+    assert not plain.clutter.in_images and not plain.clutter.neighbours
     assert (field.clutter.ring, field.clutter.stray) == (0.06, 0.05)
     field.clutter = plain.clutter
     assert field.to_yaml() == plain.to_yaml()

@@ -25,7 +25,7 @@ from iga_drake.station.simulated.model_files import (
     check_object,
     names_the_world,
 )
-from iga_drake.station.simulated.scene import Scene
+from iga_drake.station.simulated.scene import Scene, SceneObject
 from iga_drake.systems.ports import PANDA_JOINTS, ArmMode, Role
 from iga_drake.systems.segmentation import Segmentation
 from iga_drake.viewing.meshcat import add_visualizers
@@ -70,6 +70,9 @@ def build_simulation_station(
     for item in scene.objects:
         for body in added[item.name].bodies:
             roles[int(body.index())] = _ROLES[item.role]
+    for item in _neighbours(scene, scenario.clutter.neighbours):
+        for body in added[item.name].bodies:
+            roles[int(body.index())] = Role.TARGET
     plant.Finalize()
     _set_default_state(plant, panda, scene, added)
     start = plant.CreateDefaultContext()
@@ -79,26 +82,26 @@ def build_simulation_station(
 
     _add_robot_ports(builder, panda, scenario)
     add_renderer(scene_graph)
+    cameras = {}
     for index, (name, camera) in enumerate(scenario.cameras.items()):
-        ports = camera.add(
+        cameras[name] = ports = camera.add(
             builder, scene_graph, name=name, seed=(seed + scenario.seeds.cameras, index)
         )
         size = {"width": camera.intrinsics.width, "height": camera.intrinsics.height}
         segmentation = builder.AddNamedSystem(f"{name}.segmentation", Segmentation(roles, **size))
         builder.Connect(ports["label_image"], segmentation.get_input_port())
         ports["label_image"] = segmentation.get_output_port()
-        if scenario.clutter.any:
-            clutter = builder.AddNamedSystem(
-                f"{name}.clutter",
-                CameraClutter(
-                    scenario.clutter,
-                    info=camera_info(camera.intrinsics),
-                    seed=(seed + scenario.seeds.cameras, index, 2),
-                ),
-            )
+    if scenario.clutter.in_images:
+        infos = {name: camera_info(each.intrinsics) for name, each in scenario.cameras.items()}
+        clutter = builder.AddNamedSystem(
+            "clutter", CameraClutter(scenario.clutter, infos, seed=seed + scenario.seeds.cameras)
+        )
+        for name, ports in cameras.items():
+            for port in ("depth_image", "label_image", "pose"):
+                builder.Connect(ports[port], clutter.GetInputPort(f"{name}.{port}"))
             for port in ("depth_image", "label_image"):
-                builder.Connect(ports[port], clutter.GetInputPort(port))
-                ports[port] = clutter.GetOutputPort(port)
+                ports[port] = clutter.GetOutputPort(f"{name}.{port}")
+    for name, ports in cameras.items():
         for port, output in ports.items():
             builder.ExportOutput(output, f"{name}.{port}")
     if meshcat is not None:
@@ -117,6 +120,22 @@ def build_simulation_station(
 
 
 _ROLES = {"target": Role.TARGET, "grasped": Role.GRASPED, "other": Role.BACKGROUND}
+
+
+def _neighbours(scene: Scene, count: int) -> list[SceneObject]:
+    """The `count` objects of the role "other" that are nearest to a target."""
+    targets = [item.X_WO.translation() for item in scene.with_role("target")]
+    others = scene.with_role("other")
+    if count > (len(others) if targets else 0):
+        raise StationError(
+            f"clutter.neighbours: {count}, but the scene has {len(others)} objects beside "
+            f"{len(targets)} targets: state more distractors"
+        )
+
+    def distance(item: SceneObject) -> float:
+        return min(float(np.linalg.norm(item.X_WO.translation() - place)) for place in targets)
+
+    return sorted(others, key=distance)[:count]
 
 
 def _add_table(plant: MultibodyPlant, table: Table) -> None:

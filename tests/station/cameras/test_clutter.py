@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I
 
 from iga_drake.errors import ConfigError
-from iga_drake.station.cameras.clutter import CameraClutter, Clutter, cluttered
+from iga_drake.station.cameras.clutter import CameraClutter, Clutter, View, cluttered, lost_behind
 from iga_drake.systems.ports import Role
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 200.0
@@ -90,7 +91,9 @@ def test_nothing_is_changed_by_default() -> None:
     depth, label = _images()
     for found, given in zip(_clutter((depth, label)), (depth, label), strict=True):
         np.testing.assert_array_equal(found, given)
-    assert not Clutter().any and Clutter(ring=0.01).any and Clutter(stray=0.01).any
+    assert not Clutter().in_images and not Clutter(neighbours=1).in_images
+    for name in ("ring", "stray", "lost_target", "lost_grasped"):
+        assert Clutter(**{name: 0.01}).in_images
 
 
 def test_images_without_objects_and_without_depth_stay() -> None:
@@ -102,29 +105,83 @@ def test_images_without_objects_and_without_depth_stay() -> None:
                 np.testing.assert_array_equal(found[1], label)
 
 
-def _evaluate(seed: tuple[int, ...], time: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    system = CameraClutter(Clutter(ring=0.03, stray=0.1), info=INFO, seed=seed)
+def _tilted(roll: float, p_WC: tuple[float, float, float]) -> View:
+    """The square seen from a pose of the camera, as an image alone."""
+    return View(*_images(height=0.1), RigidTransform(RollPitchYaw(roll, 0, 0), p_WC), INFO)
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5])
+def test_a_part_is_lost_on_one_side_of_a_plane_of_all_cameras(share: float) -> None:
+    views = {"a": _tilted(np.pi, (0.5, 0.1, 1.0)), "b": _tilted(2.6, (0.52, -0.3, 1.1))}
+    direction = np.array([0.6, 0.64, -0.48])
+    lost = lost_behind(views, Role.TARGET, share, direction)
+    kept_points, lost_points = [], []
+    for name, view in views.items():
+        # Drake's own transform of each pixel's point.
+        for v, u in np.argwhere(view.label == Role.TARGET):
+            z = float(view.depth[v, u])
+            point = view.X_WC @ np.array([(u - 79.5) / FOCAL * z, (v - 59.5) / FOCAL * z, z])
+            (lost_points if lost[name][v, u] else kept_points).append(point @ direction)
+    assert max(lost_points) < min(kept_points)
+    assert len(lost_points) == pytest.approx(share * 800, abs=1)
+
+
+def test_nothing_is_lost_of_what_is_not_seen() -> None:
+    view = View(*_table(), RigidTransform(), INFO)
+    assert not lost_behind({"a": view}, Role.TARGET, 0.5, np.array([1.0, 0, 0]))["a"].any()
+    unmeasured = View(np.full_like(view.depth, np.nan), _images()[1], RigidTransform(), INFO)
+    assert not lost_behind({"a": unmeasured}, Role.TARGET, 0.5, np.array([1.0, 0, 0]))["a"].any()
+
+
+def _evaluate(
+    seed: int, time: float = 0.0, **options: float
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Depth and labels of two cameras at one place."""
+    clutter = Clutter(**(options or {"ring": 0.03, "stray": 0.1}))
+    system = CameraClutter(clutter, {"a": INFO, "b": INFO}, seed=seed)
     context = system.CreateDefaultContext()
     context.SetTime(time)
     depth, label = ImageDepth32F(WIDTH, HEIGHT), ImageLabel16I(WIDTH, HEIGHT)
     depth.mutable_data[:, :, 0], label.mutable_data[:, :, 0] = _images()
-    system.GetInputPort("depth_image").FixValue(context, depth)
-    system.GetInputPort("label_image").FixValue(context, label)
-    return tuple(
-        system.GetOutputPort(name).Eval(context).data[:, :, 0].copy()
-        for name in ("depth_image", "label_image")
-    )
+    for name in ("a", "b"):
+        for port, value in (
+            ("depth_image", depth), ("label_image", label), ("pose", RigidTransform()),
+        ):  # fmt: skip
+            system.GetInputPort(f"{name}.{port}").FixValue(context, value)
+    return {
+        name: tuple(
+            system.GetOutputPort(f"{name}.{port}").Eval(context).data[:, :, 0].copy()
+            for port in ("depth_image", "label_image")
+        )
+        for name in ("a", "b")
+    }
 
 
 def test_the_system_is_a_function_of_seed_and_images() -> None:
-    depth, label = _evaluate((3, 0, 2))
-    wanted = cluttered(
-        *_images(), Clutter(ring=0.03, stray=0.1), np.random.default_rng((3, 0, 2)), info=INFO
-    )
-    np.testing.assert_array_equal(depth, wanted[0])
-    np.testing.assert_array_equal(label, wanted[1])
-    np.testing.assert_array_equal(depth, _evaluate((3, 0, 2), time=1.7)[0])
-    assert (depth != _evaluate((3, 1, 2))[0]).any()
+    found = _evaluate(3)
+    for index, name in enumerate(("a", "b")):
+        rng = np.random.default_rng((3, index, 2))
+        wanted = cluttered(*_images(), Clutter(ring=0.03, stray=0.1), rng, info=INFO)
+        for image, right in zip(found[name], wanted, strict=True):
+            np.testing.assert_array_equal(image, right)
+    np.testing.assert_array_equal(found["a"][0], _evaluate(3, time=1.7)["a"][0])
+    assert (found["a"][0] != found["b"][0]).any() and (found["a"][0] != _evaluate(4)["a"][0]).any()
+
+
+def test_the_system_loses_the_same_part_in_all_cameras() -> None:
+    depth, label = _images()
+    found = _evaluate(3, lost_target=0.5)
+    for name in ("a", "b"):
+        np.testing.assert_array_equal(found[name][0], depth)
+        assert set(found[name][1][label == Role.BACKGROUND]) == {Role.BACKGROUND}
+        kept = np.count_nonzero(found[name][1] == Role.TARGET)
+        assert kept == pytest.approx(200, abs=20)  # of 400; a row or so of them is as far
+    np.testing.assert_array_equal(found["a"][1], found["b"][1])
+    np.testing.assert_array_equal(_evaluate(3, lost_grasped=0.5)["a"][1], label)
+    # Of the table that leaks into the mask as well.
+    both = _evaluate(3, lost_target=0.5, ring=0.05)["a"][1]
+    ring = _evaluate(3, ring=0.05)["a"][1]
+    assert 0 < np.count_nonzero(both) < 0.7 * np.count_nonzero(ring)
 
 
 @pytest.mark.parametrize(
@@ -133,6 +190,9 @@ def test_the_system_is_a_function_of_seed_and_images() -> None:
         ({"ring": -0.01}, r"clutter.ring: -0.01.*0 to 1"),
         ({"stray": 1.0}, r"clutter.stray: 1.0"),
         ({"stray": -0.1}, r"clutter.stray: -0.1"),
+        ({"lost_target": 1.0}, r"clutter.lost_target: 1.0"),
+        ({"lost_grasped": float("nan")}, r"clutter.lost_grasped: nan"),
+        ({"neighbours": -1}, r"clutter.neighbours: -1.*0 to 20"),
         ({"patch": 0.0}, r"clutter.patch: 0.0.*0.0001 to 1"),
         ({"spread": 0.0}, r"clutter.spread: 0.0.*0.0001 to 10"),
     ],

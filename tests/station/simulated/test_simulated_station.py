@@ -313,6 +313,29 @@ def test_clutter_gets_into_the_fused_clouds():
     assert np.abs(hovering.inverse().multiply(box.T)).max() < 0.055
 
 
+def test_the_nearest_neighbour_is_labelled_as_the_target():
+    """A box beside the ball is in its cloud, one behind isn't; a ball alone has none."""
+    beside, behind = RigidTransform([0.45, 0.15, 0.05]), RigidTransform([0.75, -0.35, 0.05])
+    objects = (
+        SceneObject("behind", "other", BOX, behind),
+        SceneObject("target", "target", BALL, X_WBALL),
+        SceneObject("beside", "other", BOX, beside),
+    )
+    scenario = _quiet()
+    scenario.clutter = Clutter(neighbours=1)
+    builder = DiagramBuilder()
+    station = builder.AddSystem(make_station(scenario, scene=_scene(objects=objects), seed=5))
+    fusion = add_fusion(builder, station, scenario)
+    context = builder.Build().CreateDefaultContext()
+    cloud = fusion.GetOutputPort("target_cloud").Eval(fusion.GetMyContextFromRoot(context)).xyzs().T
+    ball = np.abs(np.linalg.norm(cloud - X_WBALL.translation(), axis=1) - RADIUS) < 0.01
+    box = np.abs(beside.inverse().multiply(cloud.T)).max(0) < 0.055
+    assert (ball | box).all() and ball.sum() > 100 and box.sum() > 100
+    scenario.clutter = Clutter(neighbours=3)
+    with pytest.raises(StationError, match=r"clutter.neighbours: 3.*2 objects.*distractors"):
+        make_station(scenario, scene=_scene(objects=objects), seed=5)
+
+
 def test_one_of_everything_is_built_and_steps():
     scenario = load_scenario(diagrams_dir() / "one_of_everything.yaml")
     meshcat = start_meshcat(scenario.visualization)
