@@ -34,7 +34,7 @@ from pydrake.systems.lcm import LcmBuses, LcmInterfaceSystem
 
 from iga_drake.aligners.registry import EXPERT, ORACLE
 from iga_drake.drivers.franka_rs import FrankaRsArm, FrankaRsHand, connect_franka
-from iga_drake.drivers.panda import HandBridge, PandaBridge
+from iga_drake.drivers.panda import DriverLimits, HandBridge, PandaBridge
 from iga_drake.errors import IgaDrakeError, error_text
 from iga_drake.policy.inference import Inference
 from iga_drake.policy.motion import Phase
@@ -75,7 +75,11 @@ _SLICE = 0.01  # s between two looks at what the cell is asked for
 _START_LIMIT = 300.0  # s (wall clock) for the cell's processes to be built
 _ANSWER_LIMIT = 60.0  # s (wall clock)
 # Share of the arm's limits at which the driver's library follows: above those of the commands.
-_DRIVER_SPEED = 0.6
+_DRIVER_SPEED = 0.9
+# That library accelerates the arm so that it could stop at every target, and follows late by half
+# the time that it takes for it: s after which the arm has to be near what was sent, and rad by
+# which it may be behind the present command.
+_DRIVER_FOLLOWS, _DRIVER_BEHIND = 0.15, 0.1
 _NICENESS = 10  # of the cameras: the arm comes first
 
 
@@ -327,6 +331,10 @@ def run_robot(connection: Connection, request: CellRequest, plant: SharedFciPlan
             hand.close()
 
 
+def _log_driver(text: str) -> None:
+    print(f"the arm's driver: {text}", file=sys.stderr, flush=True)
+
+
 def run_driver(connection: Connection, request: CellRequest) -> None:
     """The process of the arm's driver, as `iga drive panda` is one, until the pipe is closed."""
     _begin_process()
@@ -335,8 +343,14 @@ def run_driver(connection: Connection, request: CellRequest) -> None:
         clock, rate = request.clock.now, request.clock.rate
         robot = connect_franka(request.robot_address)
         arm = FrankaRsArm(robot, speed=_DRIVER_SPEED)
-        hand = HandBridge(FrankaRsHand(robot, home=False), DrakeLcm(request.url), clock=clock)
-        bridge = PandaBridge(arm, DrakeLcm(request.url), clock=clock)
+        hand = HandBridge(
+            FrankaRsHand(robot, home=False), DrakeLcm(request.url), clock=clock, log=_log_driver
+        )
+        # The simulated arm's controller follows less closely than the real one's.
+        limits = DriverLimits(tracking=_DRIVER_BEHIND)
+        bridge = PandaBridge(
+            arm, DrakeLcm(request.url), limits=limits, clock=clock, log=_log_driver
+        )
         arm.start()
         ended = threading.Event()
 
@@ -615,6 +629,10 @@ def rehearse(
         raise RehearsalError(
             f"control mode {panda.control_mode}: this package's driver is for position"
         )
+    if driver:
+        panda = replace(panda, following_time=max(panda.following_time, _DRIVER_FOLLOWS))
+        least = max(scenario.supervisor.tracking_error, _DRIVER_BEHIND)
+        scenario = replace(scenario, supervisor=replace(scenario.supervisor, tracking_error=least))
     address = loopback_address() if driver else ""
     request = CellRequest(scenario.to_yaml(), seed, split, url, clock, address)
     with contextlib.ExitStack() as stack:

@@ -27,7 +27,6 @@ from iga_drake.systems.ports import PANDA_JOINTS, ArmMode
 
 # Until the first fresh message of a driver that was there a moment ago (s).
 _START = 0.5
-_SENT = 0.06  # s: the arm's desired position has to be near what was sent in this time
 _STRIKES = 3  # statuses in a row in which it is not
 _HAND_PERIOD = 0.1  # s, after which the hand's command is sent again
 
@@ -117,6 +116,7 @@ class PandaClient(LeafSystem):
         self.set_name("PandaClient")
         self._driver, self._lcm, self._period, self._clock = driver, lcm, period, clock
         self._only_measures = driver.control_mode == "status_only"
+        self._kept = max(1, round(driver.following_time / period))  # commands
         self._position_input = self.DeclareVectorInputPort("panda.position", PANDA_JOINTS)
         self._opening_input = self.DeclareVectorInputPort("hand.opening", 1)
         self._status_input = self.DeclareAbstractInputPort("status", Value(lcmt_panda_status()))
@@ -172,8 +172,7 @@ class PandaClient(LeafSystem):
             or (link.live and now - link.time > self._driver.expiry)
             or not far <= self._driver.tracking_error
         )
-        count = round(_SENT / self._period)
-        link = replace(link, ended=ended, sent=(*link.sent, command)[-count:])
+        link = replace(link, ended=ended, sent=(*link.sent, command)[-self._kept :])
         state.get_mutable_abstract_state(int(self._state)).set_value(link)
         return EventStatus.Succeeded()
 
@@ -194,7 +193,7 @@ class PandaClient(LeafSystem):
             return link
         desired = np.array(status.joint_position_desired)
         strikes = 0
-        if len(desired) == PANDA_JOINTS and len(link.sent) >= round(_SENT / self._period):
+        if len(desired) == PANDA_JOINTS and len(link.sent) >= self._kept:
             low, high = np.min(link.sent, axis=0), np.max(link.sent, axis=0)
             if not (
                 np.maximum(low - desired, desired - high) <= self._driver.following_error

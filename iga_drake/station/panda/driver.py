@@ -37,8 +37,10 @@ class PandaDriver:
     expiry: float = 0.05
     # Commands are sent only while the arm is within this of them (rad).
     tracking_error: float = 0.2
-    # Largest distance (rad) of the arm's desired position from what was sent in the last 60 ms.
+    # Largest distance (rad) of the arm's desired position from what was sent within so long (s). A
+    # driver that smooths what it is sent follows later: `iga drive panda` by some 50 ms.
     following_error: float = 0.02
+    following_time: float = 0.06
     # In velocity mode: how fast (1/s) the arm's distance to the commanded angles decays.
     velocity_gain: float = 5.0
     # Force (N) with which the hand closes.
@@ -55,6 +57,7 @@ class PandaDriver:
                 "expiry": (0.01, 1.0),
                 "tracking_error": (1e-3, 1.0),
                 "following_error": (1e-3, 1.0),
+                "following_time": (0.01, 1.0),
                 "velocity_gain": (0.0, 50.0),
                 "hand_force": (1.0, 70.0),
             },
