@@ -20,6 +20,8 @@ _TORQUE = [20.0] * 4 + [10.0] * 3
 _FORCE = [20.0] * 3 + [25.0] * 3
 _HAND_SPEED = 0.1  # m/s
 _FIRST_STATE = 5.0  # s, for the first state that is one
+# rad: the library ends a motion that leads further from where it began, by default than 1 rad.
+_ANYWHERE = 7.0
 _ANY_WIDTH = 0.08  # m: a grasp counts at any width
 _MODES = {
     "idle": ArmMode.IDLE,
@@ -82,7 +84,9 @@ class FrankaRsArm:
                     "all joints are exactly 0, where no arm can be: restart the robot"
                 )
         with _translated("control"):
-            targets = self._robot.joint_targets(fraction=self._speed, backend="robot")
+            targets = self._robot.joint_targets(
+                fraction=self._speed, max_deviation=_ANYWHERE, backend="robot"
+            )
             self._targets = targets.__enter__()
 
     def move_to(self, position: np.ndarray) -> None:

@@ -229,6 +229,16 @@ def test_the_arm_follows_a_moving_target_closely(plant: Plant, server: FciArm):
     assert abs(behind) < 0.1
 
 
+def test_one_motion_leads_anywhere(plant: Plant, server: FciArm):
+    arm = FrankaRsArm(connect_franka(ADDRESS), speed=0.9)
+    arm.start()
+    goal = HOME + [0, 0, 0, 0, 0, 1.4, 0]
+    arm.move_to(goal)
+    until(lambda: abs(plant.state.position - goal).max() < 1e-3, 20.0)
+    assert arm.running
+    arm.stop()
+
+
 def test_motions_that_no_driver_of_ours_asks_for_are_refused(client: RawClient):
     client.send(1, struct.pack("<II6d", 2, 0, *[0.1] * 6))  # torques of its own
     assert client.answer() == (1, b"\x05")
