@@ -30,7 +30,7 @@ class Arm(Protocol):
 
     @property
     def running(self) -> bool:
-        """Whether the arm follows targets."""
+        """True while the arm moves to the targets that it is given."""
         ...
 
     def start(self) -> None:

@@ -1,4 +1,4 @@
-"""Whether a camera still stands where its calibration says: the arm's own shape in its depth image.
+"""A check that a camera still stands where it was calibrated, by the arm's shape in its image.
 
 The depth image of the arm alone is rendered from the calibrated pose at the measured joints. Its
 points are laid onto the measured ones (point to plane, iterated closest points); what they have to
@@ -68,7 +68,7 @@ class CameraOffset:
     points: int  # of the arm that the camera should see
 
     def problem(self, limits: ArmShapeLimits) -> str:
-        """What is wrong, in words; empty if nothing is."""
+        """Why the camera has to be calibrated anew or can't be judged; "" if it is well."""
         if self.points < _FEWEST:
             return "can't tell: it hardly sees the arm; move the arm into its middle"
         if self.met < limits.met:

@@ -44,7 +44,7 @@ class CameraImages:
 
 @dataclass(frozen=True)
 class CellLook:
-    """What the cell shows at one moment."""
+    """Joints, hand opening and camera images of a cell at one moment."""
 
     joints: np.ndarray  # (7,) rad; empty where no arm was asked for
     opening: float  # m

@@ -35,7 +35,7 @@ class MeasurementError(IgaDrakeError):
 
 @dataclass
 class MeasuredPose:
-    """What was measured at one moment, everything at rest."""
+    """Where arm and board were, and the image files taken, while everything was at rest."""
 
     # With the board in the gripper: the arm's seven joint angles (rad), or X_WE outright.
     joints: list[float] = field(default_factory=list)

@@ -29,7 +29,7 @@ _SUBSETS = 20  # of images, for the start
 
 @dataclass
 class CalibrationLimits:
-    """What a calibration has to meet to be accepted."""
+    """Largest errors and smallest counts with which a calibration is accepted."""
 
     # Median error of the board's place (m) and orientation (rad) on held-out poses.
     translation: float = 0.001

@@ -14,6 +14,7 @@ import struct
 import sys
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -130,7 +131,7 @@ class FciPlant(Protocol):
         ...
 
 
-class _Server:
+class _Server(ABC):
     """Serves one client at a time on a TCP port, in a thread."""
 
     def __init__(self, address: str, port: int, rate: float) -> None:
@@ -162,8 +163,9 @@ class _Server:
                     states.setblocking(False)
                     self._serve(client, states)
 
+    @abstractmethod
     def _serve(self, client: socket.socket, states: socket.socket) -> None:
-        raise NotImplementedError
+        """Answers one client until it ends."""
 
     def _ticks(self, tick: float) -> Iterator[None]:
         """Yields once every `tick` (s of the wall clock), until the server is closed."""
